@@ -17,7 +17,7 @@ from plots import colors_of, new_figure, save
 from report import read_rows, summary, table
 
 
-@script("memory.py")
+@script("memory.py", hint="")
 def main(argv: list[str] | None) -> None:
     """Read the runs, print a table and draw a point per task, method and NFE."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)

@@ -104,7 +104,10 @@ def main(argv: list[str] | None) -> None:
             actors = trained_actors(mine, options.run.device)
             flows += straightness(actors, observations, draws=4, seed=seed)
         curvatures = write_rows(out / "curvature.jsonl", flows)
-        text = table(labelled(rows), ["method", "nfe"], JUDGED, unlike(options, NAVIGATION_PRESETS["paper"]))
+        notes = unlike(options, NAVIGATION_PRESETS["paper"])
+        if not options.position_only:
+            notes.append("Unlike in the paper, policies see sines and cosines beside the position.")
+        text = table(labelled(rows), ["method", "nfe"], JUDGED, notes)
         flow = labelled(curvatures[curvatures["mean"] == "training"])
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])
         # Before the pictures, which are the lesser loss: the trainings took the time.

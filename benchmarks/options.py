@@ -457,10 +457,11 @@ def check_typed(stored: Options, out: Path, known: Sequence[str]) -> None:
             raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")
 
 
-def script(name: str, together: bool = False) -> Callable[[Callable[..., object]], Callable[..., int]]:
+def script(
+    name: str, together: bool = False, hint: str = "--resume continues"
+) -> Callable[[Callable[..., object]], Callable[..., int]]:
     """Make a function of a command line the `main` of a script, with errors as lines and an exit code."""
-    again = "--resume continues"
-    return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together, hint=again)
+    return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together, hint=hint)
 
 
 @contextmanager

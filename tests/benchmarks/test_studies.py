@@ -166,9 +166,11 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
     assert stored(apart, "curvature") == stored(out, "curvature")
 
 
-def test_navigation_has_its_own_columns_and_pictures(tmp_path, capsys):
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_navigation_has_its_own_columns_and_pictures(preset, tmp_path, capsys):
     out = tmp_path / "runs" / "out"
     few = {"prior": ["gaussian", "regression", "past"], "iterations": 5, "episodes": 4, "chunk": 32}
+    few |= {"preset": preset, "seeds": 1, "hidden_dim": 8}
     argv = command_line(**few, envs=1, logger="none", out=out)
     assert navigation1d.main(argv) == 0
     played, curved = stored(out), stored(out, "curvature")
@@ -181,7 +183,11 @@ def test_navigation_has_its_own_columns_and_pictures(tmp_path, capsys):
         assert (row["task"], row["chunk"], row["iterations"]) == ("navigation", 32, 5)
     assert {(row["prior"], row["sigma"]) for row in curved} == policies - {("regression", 0.0)}
     assert {row["prior"] for row in curved if row["mean"] == "deployed"} == {"past"}
-    assert (out / "report.md").read_text().partition("\n\nColumns")[0] in capsys.readouterr().out
+    report = (out / "report.md").read_text()
+    assert report.partition("\n\nColumns")[0] in capsys.readouterr().out
+    assert ("sines and cosines" in report) == (preset == "quick")
+    for policy in out.parent.glob("policies/*/config.json"):
+        assert json.loads(policy.read_text())["network"]["observation_dim"] == (1 if preset == "paper" else 9)
     assert is_png(out / "navigation1d.png") and is_png(out / "flow_paths.png")
 
     # A folder with results is left alone, unless its policies are to be reused.

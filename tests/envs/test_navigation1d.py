@@ -24,8 +24,20 @@ from warmprior.envs.navigation1d import navigation_collides
 
 
 @pytest.mark.parametrize("batch_size", [(), (3,), (2, 2)])
-def test_specs(batch_size):
-    check_env_specs(NavigationEnv(batch_size=batch_size))
+@pytest.mark.parametrize("octaves", [0, 4])
+def test_specs(batch_size, octaves):
+    check_env_specs(NavigationEnv(octaves=octaves, batch_size=batch_size))
+
+
+def test_a_policy_may_see_the_position_alone():
+    rollout = NavigationEnv(octaves=0).rollout(64)
+    demonstrations = navigation_demonstrations(octaves=0)["observation"]
+    for seen in rollout["observation"], demonstrations[:64]:
+        torch.testing.assert_close(seen, navigation_positions()[:, None])
+    for make in NavigationEnv, navigation_demonstrations:
+        for octaves in -1, 1.5, True:
+            with pytest.raises(ValueError, match=f"octaves must be a whole number .*, got {octaves}"):
+                make(octaves=octaves)
 
 
 def test_demonstrations_avoid_the_obstacles_on_both_sides():

@@ -138,6 +138,7 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     """Minima and maxima by hand; the chunk is what GR00T's own processors make of it."""
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot.policies.groot import processor_groot
+    from lerobot_policy_warmprior import processor_warm_groot
     from lerobot_policy_warmprior.processor_warm_groot import check_pretrained
 
     # What encodes images and language is on the hub.
@@ -170,17 +171,25 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
         observation = {"observation.state": raw["observation.state"], "task": raw["task"]}
         assert "action_history" not in pipeline(observation)
     # A training that continues takes the saved processors, which have to remember as many actions.
-    config.pretrained_path = tmp_path
-    check_pretrained(config)
+    check_pretrained(config, str(tmp_path))
+    asked = {}
+    monkeypatch.setattr(
+        processor_warm_groot,
+        "hf_hub_download",
+        lambda *at, **more: asked.update(more) or tmp_path / "policy_preprocessor.json",
+    )
+    check_pretrained(config, "user/policy", "v1")
+    assert asked == {"revision": "v1"}
     config.prior_chunk = 4
     with pytest.raises(ValueError, match=r"remembers 3 actions, and prior='past,sigma=0.0' 4: keep its"):
-        check_pretrained(config)
+        check_pretrained(config, str(tmp_path))
     own.save_pretrained(tmp_path)
+    config.pretrained_path = "elsewhere"  # where it once came from does not count
     with (
         small("warm_groot"),
         pytest.raises(ValueError, match=r"give a checkpoint .* as --policy.base_model_path"),
     ):
-        found["warm_groot"](config)
+        found["warm_groot"].from_pretrained(tmp_path, config=config)
     before.steps[2].modality_config = {"action": {"action_configs": [{"rep": "relative"}]}}
     with pytest.raises(ValueError, match=r"has relative actions, .* choose an embodiment_tag"):
         before(dict(raw))
@@ -322,6 +331,9 @@ def test_the_flow_policy_remembers(found):
     chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
+    with pytest.raises(ValueError, match="executed_steps must be from 0 to"):
+        policy.predict_action_chunk({name: value + 1 for name, value in batch.items()}, executed_steps=99)
+    assert torch.equal(policy._queues["observation.state"][-1], batch["observation.state"])  # not seen
     policy.predict_action_chunk(dict(batch), executed_steps=2)  # of four
     assert torch.equal(sources[5][:, :2], chunks[0][:, 2:]) and torch.equal(
         sources[5][:, 2:], chunks[1][:, :2]

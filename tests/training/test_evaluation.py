@@ -248,6 +248,19 @@ def test_a_worker_that_torchrl_finds_dead_first_is_named():
         _check_for_faulty_process(workers)
 
 
+def test_a_worker_that_torchrl_ended_is_not_the_one_that_died():
+    """It terminates the others before it closes them, and they may be looked at in between."""
+    env = environments(2, sleep=0.02)
+    env.reset()
+    workers = env._workers
+    with pytest.raises(WorkerError, match=r"worker 1 of 2 \(exit code -9\) died"), watched(env):
+        os.kill(workers[1].pid, signal.SIGKILL)
+        workers[0].terminate()
+        for worker in workers:
+            worker.join()
+        raise ConnectionError
+
+
 def hold_environments(pipe):
     """Start workers, and another child that inherits the parent's ends of their pipes; wait."""
     env = environments(3, sleep=0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from warmprior import PastPrior
@@ -43,6 +44,13 @@ def test_what_is_done_before_makes_no_difference(tmp_path):
     assert not equal(policies[0], train(tmp_path / "other", training=TrainingConfig(
         iterations=8, batch_size=16, checkpoints=1, seed=1
     )))  # fmt: skip
+
+
+def test_what_does_not_exist_is_refused_with_what_does():
+    with pytest.raises(ValueError, match="style of the toy is 'toy' or 'position', got 'ph'"):
+        navigation_task("ph")
+    with pytest.raises(ValueError, match=r"--network must be one of mlp, plain_mlp, .*, got 'nonsense'"):
+        NetworkOptions(network="nonsense")
 
 
 def test_a_fresh_policy_has_the_parts_that_were_asked_for():

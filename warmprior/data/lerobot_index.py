@@ -204,7 +204,8 @@ def read_lerobot_index(
     for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
         if key in metadata.camera_keys:
             raise DatasetError(
-                f"{root}: {key!r} is no vector but an image: name it with image_keys, or leave it out"
+                f"{root}: {key!r} is no vector but an image: leave it out (LeRobotExperienceReplay reads "
+                "images by image_keys)"
             )
         if key not in columns:
             raise DatasetError(

@@ -58,6 +58,11 @@ def _middles() -> list[int]:
     return [int((navigation_positions() - c).abs().argmin()) for c in OBSTACLES]
 
 
+def _check_octaves(octaves: int) -> None:
+    if isinstance(octaves, bool) or not isinstance(octaves, int) or octaves < 0:
+        raise ValueError(f"octaves must be a whole number of at least 0, got {octaves!r}")
+
+
 def _features(x: Tensor, octaves: int) -> Tensor:
     angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, octaves - 1, device=x.device)
     return torch.cat([x.unsqueeze(-1), angle.sin(), angle.cos()], dim=-1)
@@ -74,6 +79,7 @@ def navigation_demonstrations(octaves: int = OCTAVES) -> TensorDict:
         >>> navigation_demonstrations()["observation"].shape
         torch.Size([384, 9])
     """
+    _check_octaves(octaves)
     heights = navigation_heights()
     count = len(heights)
     return TensorDict(
@@ -133,7 +139,7 @@ class NavigationEnv(EnvBase):
         device: of all tensors.
 
     Raises:
-        ValueError: if the route is not two of these numbers.
+        ValueError: if the route is not two of these numbers, or ``octaves`` no whole number of at least 0.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -157,6 +163,7 @@ class NavigationEnv(EnvBase):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
+        _check_octaves(octaves)
         self.octaves = octaves
         if route is not None and (len(route) != len(OBSTACLES) or any(side not in (1, -1) for side in route)):
             raise ValueError(f"a route is {len(OBSTACLES)} numbers 1 or -1, got {tuple(route)}")

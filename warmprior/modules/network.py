@@ -299,7 +299,8 @@ class PlainMLP(VelocityNetwork):
         return self.layers(t[:, None], a.flatten(1), observation.flatten(1)).view_as(a)
 
 
-def _check_heads(num_heads: int, embedding_dim: int) -> None:
+def _check_sizes(num_heads: int, embedding_dim: int, num_layers: int) -> None:
+    check_whole_numbers(num_heads=num_heads, embedding_dim=embedding_dim, num_layers=num_layers)
     if embedding_dim % num_heads:
         raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
 
@@ -329,7 +330,7 @@ class ChiTransformer(VelocityNetwork):
         dropout: in attention and feed-forward layers.
 
     Raises:
-        ValueError: if ``num_heads`` does not divide ``embedding_dim``.
+        ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
 
     Examples:
         >>> import torch
@@ -355,7 +356,7 @@ class ChiTransformer(VelocityNetwork):
         dropout: float = 0.1,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_heads(num_heads, embedding_dim)
+        _check_sizes(num_heads, embedding_dim, num_layers)
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
         )
@@ -449,7 +450,7 @@ class AdaLNTransformer(VelocityNetwork):
         timestep_embedding_dim: width of the time embedding before its projection.
 
     Raises:
-        ValueError: if ``num_heads`` does not divide ``embedding_dim``.
+        ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
 
     Examples:
         >>> import torch
@@ -472,7 +473,7 @@ class AdaLNTransformer(VelocityNetwork):
         timestep_embedding_dim: int = 128,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_heads(num_heads, embedding_dim)
+        _check_sizes(num_heads, embedding_dim, num_layers)
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -151,15 +152,21 @@ def watched(env: EnvBase) -> Iterator[None]:
         base.start()
     workers = list(base._workers) if isinstance(base, ParallelEnv) else []
     finished = threading.Event()
-    dead: list[str] = []
+    dead = ""
     # When it finds a dead worker, TorchRL ends and closes the others, which then answer nothing.
     closed_by_torchrl = suppress(ValueError)
 
     def look() -> None:
+        nonlocal dead
+        ended: list[tuple[int | None, str]] = []
         for i, worker in enumerate(workers):
             with closed_by_torchrl:
-                if not dead and not worker.is_alive():
-                    dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
+                if not worker.is_alive():
+                    code = worker.exitcode
+                    ended.append((code, f"worker {i} of {len(workers)} (exit code {code})"))
+        # TorchRL terminates the others, so one that ended in another way was the first.
+        ended.sort(key=lambda of: of[0] == -signal.SIGTERM)
+        dead = dead or (ended[0][1] if ended else "")
 
     def watch() -> None:
         while not finished.wait(0.5):
@@ -190,7 +197,7 @@ def watched(env: EnvBase) -> Iterator[None]:
                     worker.terminate()
         if dead:
             advice = "run one environment in this process to see its own error"
-            raise worker_died(dead[0], advice) from error
+            raise worker_died(dead, advice) from error
         raise
     finally:
         finished.set()

@@ -196,6 +196,8 @@ class NetworkOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "hidden_dim", "observation_steps", "crop_size")
+        if self.network not in _NETWORKS:
+            raise ValueError(f"--network must be one of {', '.join(_NETWORKS)}, got {self.network!r}")
 
     def check(self, data: DataOptions) -> None:
         """Refuse options of images that cannot work, or have no effect, and weights that cannot be had."""

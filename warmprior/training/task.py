@@ -352,7 +352,7 @@ def read_like(
     return dataset.data.exclude("next"), called
 
 
-def navigation_task(style: str = "toy") -> Task:
+def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
     """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
 
     In the style ``"position"`` policies see the position alone, as in the paper.
@@ -363,6 +363,8 @@ def navigation_task(style: str = "toy") -> Task:
         >>> task.title, task.make_env(batch_size=[8]).batch_size
         ('navigation toy', torch.Size([8]))
     """
+    if style not in ("toy", "position"):
+        raise ValueError(f"the style of the toy is 'toy' or 'position', got {style!r}")
     octaves = 0 if style == "position" else OCTAVES
     make_env = partial(NavigationEnv, octaves=octaves)
     return Task("navigation", style, navigation_demonstrations(octaves), make_env)
@@ -387,7 +389,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         'navigation toy'
     """
     if name == "navigation":
-        return navigation_task(style)
+        return navigation_task("position" if style == "position" else "toy")
     if name is not None and ":" in name:
         module, _, function = name.partition(":")
         try:

@@ -69,7 +69,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
         if config.network:
             try:
                 network = from_config(VelocityNetwork, json.loads(config.network))
-            except (json.JSONDecodeError, TypeError) as error:
+            except (ValueError, TypeError, AttributeError) as error:
                 raise ValueError(
                     "--policy.network is the JSON of VelocityNetwork.config(), got "
                     f"{config.network!r} ({error})"
@@ -192,12 +192,12 @@ class WarmFlowPolicy(PreTrainedPolicy):
         From present observations ``[B, d]`` and images ``[B, 3, h, w]``, and those since :meth:`reset`.
         ``executed_steps=`` tells how much of the last chunk was executed, all that is to be by default.
         """
-        self._remember(batch)
         executed = kwargs.pop("executed_steps", None)
         if executed is not None:
             self._memory.executed(executed)
         elif self._memory.waits:  # asked for chunks alone
             self._memory.executed(self.config.n_action_steps)
+        self._remember(batch)
         return self._chunk()
 
     @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 from lerobot.policies.groot.modeling_groot import GrootPolicy
 
@@ -17,7 +17,11 @@ class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     config_class = WarmGrootConfig
     name = "warm_groot"
 
-    def __init__(self, config: WarmGrootConfig, *args: Any, **kwargs: Any) -> None:
-        if config.pretrained_path:
-            check_pretrained(config)
-        super().__init__(config, *args, **kwargs)
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
+    ) -> Self:
+        """A saved policy; a ``ValueError`` if a training that continues it asks for another history."""
+        if config is not None and config.pretrained_path:  # LeRobot takes the processors as well
+            check_pretrained(config, str(pretrained_name_or_path), revision)
+        return super().from_pretrained(pretrained_name_or_path, config=config, revision=revision, **kwargs)

@@ -77,15 +77,15 @@ def make_warm_groot_pre_post_processors(
     return before, after
 
 
-def check_pretrained(config: WarmGrootConfig) -> None:
-    """Refuse a ``pretrained_path``, whose processors LeRobot takes, if they remember other actions.
+def check_pretrained(config: WarmGrootConfig, place: str, revision: str | None = None) -> None:
+    """Refuse a saved policy, whose processors LeRobot takes, if they remember other actions.
 
     Raises:
         ValueError: if they are GR00T's own, or remember another number of actions.
     """
-    place, name = str(config.pretrained_path), f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
+    name, folder = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", Path(place)
     try:
-        file = Path(place) / name if Path(place).is_dir() else Path(hf_hub_download(place, name))
+        file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, revision=revision))
         steps = json.loads(file.read_text())["steps"] if file.exists() else []
     except RemoteEntryNotFoundError:
         steps = []  # a checkpoint of GR00T itself
