@@ -62,7 +62,10 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "mean_revision_data": (".3f", "root mean square from the source's mean to the prediction, on data"),
     "mean_revision": (".3f", "root mean square from the source's mean to the prediction, in episodes"),
     # What reaches the actions, on 512 observations of the training data.
-    "source_leak": (".2f", "spread of actions over draws of the source / that of the data; (!): above 1"),
+    "source_leak": (
+        ".2f",
+        "spread of actions over draws of the source / that of the data; (!): above 1, noise gets through",
+    ),
     "inner_step_ratio": (".2f", "step between actions of a chunk / that of the data; (!): above 1.3"),
     "memory_gain": (
         "z.3f",

@@ -111,20 +111,27 @@ def small_network() -> VelocityMLP:
     return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
 
 
-def cloning(network: nn.Module, folder: str | Path) -> BehaviourCloning:
-    """A training of the network, ready to step."""
-    actor, config = WarmPriorActor(network, PRIOR), TrainingConfig(batch_size=BATCH)
-    training = BehaviourCloning(actor, steps(400, 200), config, folder, observation_steps=TO)
+def cloning(network: nn.Module, folder: str | Path, device: str = "cpu") -> BehaviourCloning:
+    """A training of the network, ready to step; on a GPU as CUDA graphs."""
+    actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=BATCH)
+    options: dict[str, Any] = {"observation_steps": TO, "compile": device == "cuda"}
+    training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, **options)
     actor.train()
     return training
 
 
-def step_of(network: nn.Module) -> Callable[[], None]:
-    """A training step of a network alone, on random numbers."""
+def step_of(network: nn.Module, device: str = "cpu") -> Callable[[], None]:
+    """A training step of a network alone, on random numbers; on a GPU as CUDA graphs."""
+    network.to(device)
+    if device == "cuda":
+        network.compile(mode="reduce-overhead")
     optimizer = torch.optim.AdamW(network.parameters(), fused=True)
-    t, a, o = torch.rand(BATCH), torch.randn(BATCH, H, D_A), torch.randn(BATCH, TO, D_O)
+    shapes = (BATCH,), (BATCH, H, D_A), (BATCH, TO, D_O)
+    t, a, o = (torch.rand(shape, device=device) for shape in shapes)
 
     def step() -> None:
+        if device == "cuda":
+            torch.compiler.cudagraph_mark_step_begin()
         loss = network(t, a, o).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -204,9 +211,13 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
 # Training
 
 
-def train_step_over_network(clock: Clock) -> float:
+def train_step_over_network(clock: Clock, device: str = "cpu", calls: int = 1) -> float | None:
+    if device == "cuda" and not torch.cuda.is_available():
+        tqdm.write("cuda_train_step_over_network: skipped, needs a GPU")
+        return None
     with tempfile.TemporaryDirectory() as folder:
-        return clock.ratio(cloning(paper_network(), folder).step, step_of(paper_network()))
+        ours = cloning(paper_network(), folder, device).step
+        return clock.ratio(ours, step_of(paper_network(), device), calls=calls)
 
 
 def preconditioning_over_network(clock: Clock) -> float:
@@ -326,6 +337,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
+    "cuda_train_step_over_network": (partial(train_step_over_network, device="cuda", calls=20), "<= 1.05"),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "ddp_efficiency": (ddp_efficiency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),

@@ -102,8 +102,7 @@ folder.cleanup()
 # How far that goes
 # -----------------
 # With two cores WP-Past on square played 1.87 times as many episodes per minute as with one, and trainings
-# side by side took 1.96 times as many steps. A vectorised environment, in which all rows wait for the
-# slowest at every decision, was behind (:doc:`/scaling`).
+# side by side took 1.96 times as many steps (:doc:`/scaling`).
 #
 # More machines
 # -------------
