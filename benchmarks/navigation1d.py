@@ -3,7 +3,7 @@
 python benchmarks/navigation1d.py                      # all policies, one seed, a few minutes
 python benchmarks/navigation1d.py --seeds 5
 python benchmarks/navigation1d.py --chunk 1            # a decision at every step
-python benchmarks/navigation1d.py --preset paper       # the paper's width and iterations, five seeds
+python benchmarks/navigation1d.py --preset paper       # the paper's network and training, five seeds
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STEPS = 32  # half of an episode: the longest chunk
 class NavigationOptions(Options):
     """A comparison of sources on the toy; its episodes are rollouts."""
 
-    position_only: bool = False  # policies see no sines and cosines of it, as in the paper
+    position_only: bool = False  # policies see it without its sines and cosines, as in the paper
 
     @property
     def name(self) -> str:

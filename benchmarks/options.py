@@ -76,7 +76,7 @@ class Evaluation:
     episodes: int = 25  # evaluation episodes per cell
     nfe: tuple[int, ...] = (9, 3, 1)  # network evaluations per chunk
     top_k: int = 1  # best checkpoints averaged per seed
-    play_on: bool = False  # go on after success, up to the time limit; solved is solved at any step
+    play_on: bool = False  # go on after success, up to the time limit; success at any step counts
     grid: str = "uniform"  # uniform, or dense-jump (one last step from half way; dense-jump:0.7 from there)
 
     def __post_init__(self) -> None:
@@ -99,11 +99,11 @@ class Run:
     out: Path | None = None  # output folder (default: a numbered one under runs/)
     resume: bool = False  # continue in --out, or in the latest default folder, with the options stored there
     envs: int | None = None  # worker processes, with the same results (default: one per core)
-    device: str = "cpu"  # of networks and data, such as cuda; one per process under torchrun
-    films: bool = True  # of an episode of every method, and filmstrips; they take time
+    device: str = "cpu"  # of networks and data, such as cuda; under torchrun each process takes its own
+    films: bool = True  # save a film and a filmstrip of one episode per method, which takes time
     compile: bool = False  # torch.compile the network in training
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"  # of the training curves
-    engine: Literal["local", "ray"] = "local"  # who computes: processes of this machine, or a Ray cluster
+    engine: Literal["local", "ray"] = "local"  # where jobs run: processes of this machine, or a Ray cluster
     ray_address: str | None = None  # HOST:PORT of its head (default: $RAY_ADDRESS, or this machine alone)
 
     def __post_init__(self) -> None:
@@ -192,7 +192,7 @@ FinishedRun = Annotated[Path | None, tyro.conf.arg(name="run")]
 class MeasuredOptions(Options):
     """A comparison with measures on observations that no policy was trained on."""
 
-    validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
+    validation: Path | None = None  # demonstrations to measure on, given as for --dataset (default: new ones)
     observations: int = 500  # how many to measure on; the paper's curvature has 2000
 
     def check(self) -> None:

@@ -5,7 +5,7 @@ python benchmarks/pusht.py --dataset lerobot:FOLDER --demonstrations 25
 python benchmarks/pusht.py --task pusht:relative                   # actions are offsets from the agent
 python benchmarks/sigma.py --task pusht:task --dataset lerobot:FOLDER
 
-It needs the extra pusht (pip install -e '.[pusht]'). An episode's `coverage` is the best share of the goal
+It needs two extras (pip install -e '.[sim,pusht]'). An episode's `coverage` is the best share of the goal
 that the block covers; it is solved above 0.95.
 """
 

@@ -16,8 +16,8 @@ GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior,\nsmall sigma", BLUE),
     ("Do chunks take effect late?", "PreviewPrior\nwith guidance", ORANGE),
-    ("Are actions absolute poses?", "GaussianPrior", GREY),
-    ("Can you afford nine steps a chunk?", "GaussianPrior", GREY),
+    ("Are actions absolute arm poses?", "GaussianPrior", GREY),
+    ("Nine steps, many demonstrations?", "GaussianPrior", GREY),
     ("At most 25 demonstrations?", "PastPrior or\nPreviewPrior", BLUE),
 )
 

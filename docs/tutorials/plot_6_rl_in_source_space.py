@@ -299,7 +299,7 @@ folder.cleanup()
 # In earnest
 # ----------
 # This was one seed of each. The benchmark has the same toy with larger networks, 12,000 control
-# steps and three seeds: ``python benchmarks/prior_space_rl.py --preset unit --prior gaussian past``.
+# steps and three seeds: ``benchmarks/prior_space_rl.py --preset unit --prior gaussian past --centre mean``.
 # :doc:`The lab notes </evidence>` have the results. With chunks of eight both agents
 # learn to solve every episode, in about the same number of steps. With chunks of four the Gaussian
 # policy meets the reward so rarely that its agent never learns where it is, and WP-Past's agent does as
@@ -312,6 +312,6 @@ folder.cleanup()
 #    python benchmarks/prior_space_rl.py
 #    python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 #
-# The agents of those recipes have not been measured with the present policies.
+# Agents of the first are in the lab notes. The second needs a GPU, and was not run.
 # :doc:`/prior_space_rl` has the parts for a training loop of your own, TorchRL's own losses, and what
 # to check on a task of yours: negate the reward, and success should vanish.

@@ -341,9 +341,8 @@ folder.cleanup()
 #        --policy.prior=preview --policy.n_action_steps=25 \
 #        --dataset.repo_id=USER/DATASET --batch_size=32 --steps=3000
 #
-# GR00T, pi0 and X-VLA have no types of their own there. They are trained in Python as above, by
-# ``WarmPriorAdapter(policy, PastPrior(16)).loss(batch)``; GR00T's preprocessor takes no longer
-# windows, so that its history goes in as ``batch["action_history"]`` (:doc:`/lerobot`).
+# GR00T N1.7 is ``--policy.type=warm_groot``. pi0, X-VLA and GR00T N1.5 have no types there, and are
+# trained in Python as above, by ``WarmPriorAdapter(policy, PastPrior(16)).loss(batch)`` (:doc:`/lerobot`).
 #
 # What was run: this page; the losses and samplers of all these families, LeRobot's own classes with
 # small random weights, against flow matching written by hand; and the library's own policy through

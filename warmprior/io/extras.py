@@ -1,4 +1,4 @@
-"""Optional dependencies: the core needs only torch, tensordict and torchrl."""
+"""Optional dependencies: the core needs only what `pip install warmprior` brings."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class DataOptions:
         mask: name of a mask in the file, such as train; only its demonstrations are used.
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
-        actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
+        actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
         obs: what policies see: the state of robot and objects, or that of the robot and images.
         cameras: of the images; by default the task's two, or four with two arms.
         image_size: side of the images in pixels.
@@ -167,8 +167,8 @@ class NetworkOptions:
     """The velocity network.
 
     Attributes:
-        network: its kind; the paper's are chi_transformer and, for the toy, plain_mlp; adaln_transformer is
-            a faster transformer.
+        network: mlp is small, and the default; chi_transformer is the paper's, and plain_mlp that of its toy;
+            adaln_transformer is a faster transformer (adaptive layer norm).
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
@@ -258,9 +258,9 @@ Precision = Literal["float32", "bf16"]
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The recipe; the defaults are those of every table here: a small preconditioned network on a CPU.
+    """The recipe; the defaults are those of the robot tasks' tables: a small preconditioned network on a CPU.
 
-    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe. A ValueError
+    They were chosen from success against iterations. PAPER is the paper's recipe. A ValueError
     names a number that is out of its range.
 
     Attributes:
