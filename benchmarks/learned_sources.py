@@ -152,7 +152,7 @@ class ForecastPrior(LearnedPrior):
 
 
 class LeapPrior(ForecastPrior):
-    """A learnable prior: the Gaussian source of :class:`ForecastPrior` from the observation alone."""
+    """LeaP (arXiv:2606.17408): the Gaussian source of :class:`ForecastPrior` from the observation alone."""
 
     name = "leap"
     sees_history = False

@@ -96,7 +96,7 @@ METHODS: dict[str, Composition] = {
     "step": Composition("STEP", "#00695c", start=ForecastStart),
     "cvae": Composition("CVAE source", "#c51b7d", CVAEPrior),
     "a2a": Composition("A2A (action space)", "#7f3b08", A2APrior),
-    "leap": Composition("Learnable prior", "#b8a9c9", LeapPrior),
+    "leap": Composition("LeaP", "#b8a9c9", LeapPrior),
 }
 
 OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf"]
