@@ -150,3 +150,14 @@ def test_no_worker_outlives_the_driver(how, tmp_path):
     if how == signal.SIGINT:
         assert code == 130
         assert process.stderr.read().decode().splitlines()[-1] == "sleep.py: interrupted"
+
+
+def test_without_a_terminal_trainings_say_now_and_then_how_far_they_are(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(jobs, "LINES_EVERY", -1)
+    status = tmp_path / "status.json"
+    running = [jobs.Job("train square", play, (), status=status), jobs.Job("play square", play, ())]
+    with Jobs(Run(envs=1)) as started, jobs.tqdm(disable=True) as bar:
+        started._show(bar, running)
+        status.write_text('{"iteration": 1500, "iterations": 3000}')
+        started._show(bar, running)
+    assert capsys.readouterr().out == "train square: 1,500 of 3,000 iterations\n"

@@ -46,6 +46,10 @@ def test_unknown_environment_uses_what_it_finds(tmp_path):
         *("robot1_eef_pos", "robot1_gripper_qpos"),
     )
 
+    for nothing in [], ():
+        with pytest.raises(DatasetError, match=r"file\.hdf5: no observations are chosen; .*robot0_eef_pos"):
+            read_index(path, observation_keys=nothing)
+
 
 # ---------------------------------------------------------------------------- bad files
 def test_missing_file(tmp_path):

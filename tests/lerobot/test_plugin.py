@@ -178,7 +178,7 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
         "hf_hub_download",
         lambda *at, **more: asked.update(more) or tmp_path / "policy_preprocessor.json",
     )
-    check_pretrained(config, "user/policy", "v1")
+    check_pretrained(config, "user/policy", revision="v1")
     assert asked == {"revision": "v1"}
     config.prior_chunk = 4
     with pytest.raises(ValueError, match=r"remembers 3 actions, and prior='past,sigma=0.0' 4: keep its"):
@@ -314,6 +314,18 @@ def test_the_flow_policys_loss_is_algorithm_1(found):
     torch.testing.assert_close(loss.detach(), error[inside].mean())
     with pytest.raises(KeyError, match="lacks action_is_pad"):
         policy.forward({k: v for k, v in batch.items() if k != "action_is_pad"})
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        *("[", "3", '"x"', '{"name": "none"}', '{"name": "PlainMLP", "hidden_dim": -3}'),
+        '{"name": "PreconditionedNetwork", "network": 5}',
+    ],
+)
+def test_a_network_that_cannot_be_made_is_named(found, network):
+    with pytest.raises(ValueError, match=r"--policy\.network is the JSON of VelocityNetwork\.config\(\)"):
+        flow_policy(found, network=network)
 
 
 def test_the_flow_policy_remembers(found):

@@ -67,6 +67,13 @@ def test_plain_mlp_is_four_layers_by_hand():
     torch.testing.assert_close(network(t, a, observation), (x @ weights[6].T + weights[7]).reshape(5, 4, 2))
 
 
+@pytest.mark.parametrize("kind", [VelocityMLP, PlainMLP])
+@pytest.mark.parametrize("size", [0, -3, 1.5])
+def test_a_width_that_cannot_work_is_named(kind, size):
+    with pytest.raises(ValueError, match=f"hidden_dim must be a whole number of at least 1, got {size}"):
+        kind(2, 3, 4, hidden_dim=size)
+
+
 @pytest.mark.parametrize("dim", [4, 8, 128])
 def test_timestep_embedding_closed_form(dim):
     times = [0.0, 0.1, 0.5, 1.0]

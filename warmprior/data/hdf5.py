@@ -204,9 +204,9 @@ def _mask(file: h5py.File, path: Path, filter_key: str) -> set[str]:
     entries, demos = member(file["mask"], filter_key, "dataset"), len(names(file["data"]))
     what = f"{path}: mask/{filter_key}"
     if entries is None or entries.shape is None or entries.ndim != 1 or entries.dtype.kind not in "SO":
+        found = "leads to nothing" if entries is None else f"is {entries}"
         raise DatasetError(
-            f"{what} is no list of the names of demos, but {entries}. Choose another filter key or rebuild "
-            "the mask."
+            f"{what} {found}, no list of the names of demos. Choose another filter key or rebuild the mask."
         )
     if len(entries) > demos:
         raise DatasetError(f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask")

@@ -253,10 +253,11 @@ def memory_gain(
         FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:
+        >>> import torch
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.diagnostics import SharedObservations, memory_gain
         >>> from warmprior.envs import navigation_demonstrations
-        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> shared, _ = SharedObservations(navigation_demonstrations(), 4), torch.manual_seed(0)
         >>> def measured(prior):
         ...     untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), prior)
         ...     return memory_gain(untrained, shared.windows(prior))[1]

@@ -237,6 +237,7 @@ class VelocityMLP(VelocityNetwork):
         timestep_embedding_dim: int = 32,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        check_whole_numbers(hidden_dim=hidden_dim, num_blocks=num_blocks)
         chunk = prediction_length * action_dim
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim),
@@ -289,6 +290,7 @@ class PlainMLP(VelocityNetwork):
         hidden_dim: int = 1024,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        check_whole_numbers(hidden_dim=hidden_dim)
         chunk = prediction_length * action_dim
         inputs = 1 + chunk + observation_steps * observation_dim
         self.layers = MLP(inputs, chunk, depth=3, num_cells=hidden_dim, activation_class=nn.GELU)

@@ -23,5 +23,7 @@ class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     ) -> Self:
         """A saved policy; a ``ValueError`` if a training that continues it asks for another history."""
         if config is not None and config.pretrained_path:  # LeRobot takes the processors as well
-            check_pretrained(config, str(pretrained_name_or_path), revision)
+            names = ("token", "cache_dir", "local_files_only", "force_download")
+            hub = {name: kwargs[name] for name in names if name in kwargs}
+            check_pretrained(config, str(pretrained_name_or_path), revision=revision, **hub)
         return super().from_pretrained(pretrained_name_or_path, config=config, revision=revision, **kwargs)

@@ -77,15 +77,17 @@ def make_warm_groot_pre_post_processors(
     return before, after
 
 
-def check_pretrained(config: WarmGrootConfig, place: str, revision: str | None = None) -> None:
+def check_pretrained(config: WarmGrootConfig, place: str, **hub: Any) -> None:
     """Refuse a saved policy, whose processors LeRobot takes, if they remember other actions.
+
+    ``hub`` is for the download, such as ``revision``.
 
     Raises:
         ValueError: if they are GR00T's own, or remember another number of actions.
     """
     name, folder = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", Path(place)
     try:
-        file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, revision=revision))
+        file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, **hub))
         steps = json.loads(file.read_text())["steps"] if file.exists() else []
     except RemoteEntryNotFoundError:
         steps = []  # a checkpoint of GR00T itself
