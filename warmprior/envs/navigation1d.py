@@ -115,17 +115,17 @@ class NavigationEnv(EnvBase):
     There are no dynamics: the action *is* the height, the position advances by itself, and an episode lasts
     64 steps. The environment holds no state: what it needs arrives in the tensordict.
 
-    =================  ==================  ===============================================
-    key                shape               meaning
-    =================  ==================  ===============================================
-    ``"observation"``  ``[*B, d_o]`` float position in [-1, 1], its sines and cosines
-    ``"action"``       ``[*B, 1]`` float   height, in units of the normalised action space
-    ``"reward"``       ``[*B, 1]`` float   1 at the end of an episode that succeeds
-    ``"step_index"``   ``[*B, 1]`` int64   steps done, 0 to 64
-    ``"height"``       ``[*B, 1]`` float   the last action
-    ``"collided"``     ``[*B, 1]`` bool    whether the path entered an obstacle
-    ``"success"``      ``[*B, 1]`` bool    whether it ended without collision, on the route
-    =================  ==================  ===============================================
+    =================  ===================  ===============================================
+    key                shape                meaning
+    =================  ===================  ===============================================
+    ``"observation"``  ``[*B, d_o]`` float  position in [-1, 1], its sines and cosines
+    ``"action"``       ``[*B, 1]`` float    height, in units of the normalised action space
+    ``"reward"``       ``[*B, 1]`` float    1 at the end of an episode that succeeds
+    ``"step_index"``   ``[*B, 1]`` int64    steps done, 0 to 64
+    ``"height"``       ``[*B, 1]`` float    the last action
+    ``"collided"``     ``[*B, 1]`` bool     whether the path entered an obstacle
+    ``"success"``      ``[*B, 1]`` bool     whether it ended without collision, on the route
+    =================  ===================  ===============================================
 
     With a route it is a small task with a sparse reward: an episode ends at the first collision, and at the
     first obstacle passed on the wrong side, with reward 0. The demonstrations do not know the route, so that
