@@ -237,27 +237,19 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(moment):
     assert all(ended(pid) for pid in pids), "a worker still runs"
 
 
-def test_a_worker_that_torchrl_finds_dead_first_is_named():
-    """It then closes the other workers, of which nothing can be asked any more."""
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_worker_that_torchrl_finds_dead_first_is_named(closed):
+    """It then terminates the others and closes them, and they may be looked at in between."""
     env = environments(2, sleep=0.02)
     env.reset()
     workers = env._workers
     with pytest.raises(WorkerError, match=r"worker 1 of 2 \(exit code -9\) died"), watched(env):
         os.kill(workers[1].pid, signal.SIGKILL)
         workers[1].join()
-        _check_for_faulty_process(workers)
-
-
-def test_a_worker_that_torchrl_ended_is_not_the_one_that_died():
-    """It terminates the others before it closes them, and they may be looked at in between."""
-    env = environments(2, sleep=0.02)
-    env.reset()
-    workers = env._workers
-    with pytest.raises(WorkerError, match=r"worker 1 of 2 \(exit code -9\) died"), watched(env):
-        os.kill(workers[1].pid, signal.SIGKILL)
+        if closed:
+            _check_for_faulty_process(workers)
         workers[0].terminate()
-        for worker in workers:
-            worker.join()
+        workers[0].join()
         raise ConnectionError
 
 

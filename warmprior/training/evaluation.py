@@ -158,15 +158,14 @@ def watched(env: EnvBase) -> Iterator[None]:
 
     def look() -> None:
         nonlocal dead
-        ended: list[tuple[int | None, str]] = []
+        ended = []
         for i, worker in enumerate(workers):
             with closed_by_torchrl:
                 if not worker.is_alive():
-                    code = worker.exitcode
-                    ended.append((code, f"worker {i} of {len(workers)} (exit code {code})"))
-        # TorchRL terminates the others, so one that ended in another way was the first.
-        ended.sort(key=lambda of: of[0] == -signal.SIGTERM)
-        dead = dead or (ended[0][1] if ended else "")
+                    ended.append((worker.exitcode == -signal.SIGTERM, i, worker.exitcode))
+        if ended and not dead:  # TorchRL terminates the others: one that ended in another way was the first
+            _, i, code = min(ended)
+            dead = f"worker {i} of {len(workers)} (exit code {code})"
 
     def watch() -> None:
         while not finished.wait(0.5):
