@@ -35,7 +35,7 @@ STEPS = 32  # half of an episode: the longest chunk
 class NavigationOptions(Options):
     """A comparison of sources on the toy; its episodes are rollouts."""
 
-    position_only: bool = False  # policies see it without its sines and cosines, as in the paper
+    position_only: bool = False  # policies see the position without its sines and cosines, as in the paper
 
     @property
     def name(self) -> str:

@@ -67,11 +67,17 @@ def test_plain_mlp_is_four_layers_by_hand():
     torch.testing.assert_close(network(t, a, observation), (x @ weights[6].T + weights[7]).reshape(5, 4, 2))
 
 
-@pytest.mark.parametrize("kind", [VelocityMLP, PlainMLP])
-@pytest.mark.parametrize("size", [0, -3, 1.5])
-def test_a_width_that_cannot_work_is_named(kind, size):
-    with pytest.raises(ValueError, match=f"hidden_dim must be a whole number of at least 1, got {size}"):
-        kind(2, 3, 4, hidden_dim=size)
+SIZES = {VelocityMLP: "hidden_dim num_blocks", PlainMLP: "hidden_dim"}
+SIZES |= dict.fromkeys([AdaLNTransformer, ChiTransformer], "embedding_dim num_layers num_heads")
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [(k, size) for k, names in SIZES.items() for size in names.split()]
+)
+@pytest.mark.parametrize("value", [0, -3, 1.5])
+def test_a_size_that_cannot_work_is_named(kind, size, value):
+    with pytest.raises(ValueError, match=f"{size} must be a whole number of at least 1, got {value}"):
+        kind(2, 3, 4, **{size: value})
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])
