@@ -26,7 +26,7 @@ benchmark: install
 	$(BIN)/python benchmarks/robomimic.py $(ARGS)
 
 throughput: install
-	$(BIN)/python benchmarks/dev/throughput.py $(ARGS)
+	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
 # Files side by side, one per core: tests of one file share what they have trained.
 PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile

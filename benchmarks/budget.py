@@ -13,17 +13,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 
-from common import policies_of, write_rows
-from measures import held_out
-from options import PRESETS, MeasuredOptions, check_given, check_single, parse, script, started, study
-from plots import plot_lines
-from report import labelled, per_seed, table, write_report
-from robomimic import compare
-
+from lab.comparison import compare
+from lab.files import read_lines
+from lab.measures import held_out
+from lab.options import PRESETS, MeasuredOptions, check_given, check_single, parse, script, started, study
+from lab.plots import plot_lines
+from lab.policies import policies_of, write_rows
+from lab.report import labelled, per_seed, table, write_report
+from lab.tasks import check_counts
 from warmprior.diagnostics import action_error, encoded_windows
-from warmprior.io.files import read_lines
 from warmprior.training import TrainingConfig
-from warmprior.training.options import check_counts
 
 
 @dataclass(frozen=True)

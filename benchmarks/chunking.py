@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import sys
 
-from common import policies_of, slug
-from options import PRESETS, check_single, parse, script, started, with_parts
-from plots import plot_bars, plot_lines, plot_success
-from report import labelled, per_seed, table, write_report
-from robomimic import compare
+from lab.comparison import compare
+from lab.options import PRESETS, check_single, parse, script, started, with_parts
+from lab.plots import plot_bars, plot_lines, plot_success
+from lab.policies import policies_of, slug
+from lab.report import labelled, per_seed, table, write_report
 
 JUMPS = ("boundary_jump", "inner_jump")
 

@@ -10,14 +10,14 @@ import sys
 from dataclasses import dataclass
 
 import torch
-from common import facts_of, finished_policies, policies_of, trained_actors, write_rows
-from measures import RATIOS, held_out, straightness
-from options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
-from paper import PAPER_CURVATURE
-from plots import plot_flow_paths
-from report import labelled, pooled, problem_title, table, text_of, write_report
-from robomimic import train_all
 
+from lab.comparison import train_all
+from lab.measures import RATIOS, held_out, straightness
+from lab.options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
+from lab.paper import PAPER_CURVATURE
+from lab.plots import plot_flow_paths
+from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
+from lab.report import labelled, pooled, problem_title, table, text_of, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
 

@@ -12,9 +12,10 @@ import sys
 from pathlib import Path
 
 import pandas as pd
-from options import script
-from plots import colors_of, new_figure, save
-from report import read_rows, summary, table
+
+from lab.options import script
+from lab.plots import colors_of, new_figure, save
+from lab.report import read_rows, summary, table
 
 
 @script("memory.py", hint="")

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import sys
 
-from options import PRESETS, Options, adapted, script, with_parts
 from robomimic import run
+
+from lab.options import PRESETS, Options, adapted, script, with_parts
 
 # The paper's number of demonstrations, and a training for so few.
 FEW = {

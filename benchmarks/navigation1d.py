@@ -13,15 +13,17 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 import torch
-from common import policies_of, trained_actors, write_rows
-from measures import straightness
-from options import Evaluation, Options, Sources, check_single, parse, script, started
-from plots import plot_flow_paths, plot_navigation
-from report import labelled, table, unlike, write_report
-from robomimic import train_all
 
+from lab.comparison import train_all
+from lab.measures import straightness
+from lab.navigation import judge_navigation, play_navigation
+from lab.options import Evaluation, Options, Sources, check_single, parse, script, started
+from lab.plots import plot_flow_paths, plot_navigation
+from lab.policies import policies_of, trained_actors, write_rows
+from lab.report import labelled, table, unlike, write_report
+from lab.tasks import DataOptions
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.training import DataOptions, NetworkOptions, TrainingConfig, judge_navigation, play_navigation
+from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.options import PAPER
 
 JUDGED = [  # columns of the table

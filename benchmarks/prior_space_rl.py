@@ -20,10 +20,14 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 import tyro
-from common import facts_of, finished_policies, policies_of, slug, trained_actors, write_rows
-from methods import ColdPrior, Method
 from navigation1d import NAVIGATION_PRESETS
-from options import (
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from lab.comparison import train_all
+from lab.files import read_lines
+from lab.methods import ColdPrior, Method
+from lab.options import (
     PRESETS,
     Evaluation,
     FinishedRun,
@@ -37,22 +41,19 @@ from options import (
     study,
     with_parts,
 )
-from plots import plot_lines, plot_success
-from report import labelled, problem_title, table, write_report
-from robomimic import train_all
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.transforms import Compose
-
+from lab.plots import plot_lines, plot_success
+from lab.policies import facts_of, finished_policies, policies_of, slug, trained_actors, write_rows
+from lab.report import labelled, problem_title, table, write_report
+from lab.tasks import DataOptions, check_counts, check_network
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
 from warmprior.diagnostics.flow import sees_history
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.files import read_json, read_lines
+from warmprior.io.files import read_json
 from warmprior.io.workers import torch_threads
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
-from warmprior.training import DataOptions, parallel_env
-from warmprior.training.options import check_counts
+from warmprior.training import parallel_env
 from warmprior.transforms import EncodeObservation
 
 TOY = "navigation"
@@ -143,7 +144,7 @@ class AgentsOptions(Options):
             raise ValueError("--collectors belongs to --engine ray")
         if not self.is_toy and self.policies is None:
             self.data.check()
-            self.network.check(self.data)
+            check_network(self.network, self.data)
         for method in self.sources.methods():
             if not method.is_flow:
                 raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
@@ -300,6 +301,11 @@ def learn(
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
     parts = {"horizon": options.horizon, **options.evaluation.environment}
+    rounds = None
+    if options.collectors is not None:
+        from lab.ray_collection import ray_rounds
+
+        rounds = partial(ray_rounds, collectors=options.collectors, address=options.run.ray_address)
     encoders = encoding(actor)  # one that sees images reads their features, as the agent does
     training = PriorSpaceTraining(
         actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
@@ -308,8 +314,7 @@ def learn(
         out / slug(name.replace(" ", "-")),
         evaluation_seed=EVALUATION_SEED,
         description=name,
-        collectors=options.collectors,
-        ray_address=options.run.ray_address,
+        collect=rounds,
     )
     with torch_threads(1):  # workers that end set it otherwise
         training.run()

@@ -16,14 +16,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from options import PRESETS, script, with_parts
 from robomimic import run
 from torchrl.envs import EnvBase
 
+from lab.options import PRESETS, script, with_parts
+from lab.tasks import DataOptions
 from warmprior.data import lerobot_steps
 from warmprior.envs import gym_env
 from warmprior.io.extras import require
-from warmprior.training import DataOptions, Task
+from warmprior.training import Task
 
 SIDE = 512.0  # of the field, in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners

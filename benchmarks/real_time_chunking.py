@@ -16,15 +16,14 @@ import sys
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
-from common import Cell, policies_of
-from methods import Method
-from options import PRESETS, Options, check_given, check_single, parse, script, started, study
-from plots import plot_bars
-from report import labelled, per_seed, table, write_report
-from robomimic import compare
-
+from lab.comparison import compare
+from lab.methods import Method
+from lab.options import PRESETS, Options, check_given, check_single, parse, script, started, study
+from lab.plots import plot_bars
+from lab.policies import Cell, policies_of
+from lab.report import labelled, per_seed, table, write_report
+from lab.tasks import check_counts
 from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.training.options import check_counts
 from warmprior.transforms.delay import check_delay
 
 STUDY = "real-time-chunking"

@@ -10,30 +10,15 @@ python benchmarks/robomimic.py --resume --out runs/paper         # after an inte
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from itertools import product
+from collections.abc import Mapping
 from typing import Any
 
-import pandas as pd
-from common import Cell, Policy, facts_of, play, policies_of, row, train, write_rows
-from jobs import Jobs
-from measures import measure
-from methods import Method
-from options import PRESETS, Evaluation, Options, parse, script, started
-from pictures import draw
-from report import success_report, summary, terminal_table, unlike, write_report
-
-from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.distributed import go_on_alone, rank, world_size
-from warmprior.io.files import check_writable, read_lines, write_atomic
-from warmprior.io.script import PartialFailure
-from warmprior.training import Episode
-
-EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
+from lab.comparison import compare
+from lab.options import PRESETS, Options, parse, script, started
+from lab.pictures import draw
+from lab.policies import policies_of
+from lab.report import success_report, summary, terminal_table, unlike, write_report
 
 
 def run(
@@ -43,8 +28,8 @@ def run(
     options = parse(presets, argv, study, doc, **parsing)
     with started(options, study) as out:
         # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
-        # seed: network, recipe and data are equal, and the source (methods.py) differs. It meets the loss in
-        # common.py, in `train`.
+        # seed: network, recipe and data are equal, and the source (lab/methods.py) differs. It meets the loss
+        # in lab/policies.py, in `train`.
         policies = policies_of(options)
 
         # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
@@ -60,129 +45,6 @@ def run(
             write_report(out, terminal_table(results, top_k), full, results, failures)
         finally:
             draw(options, policies, rows)  # pictures are the lesser loss
-
-
-def compare(
-    options: Options,
-    policies: Sequence[Policy],
-    conditions: Callable[[Method], Sequence[Cell]] = lambda method: [Cell(0, 0)],
-) -> tuple[pd.DataFrame, list[str]]:
-    """Train, measure and play what is missing; the rows so far, and what failed.
-
-    Rows do not depend on who computes them, nor in which order. `conditions` lists how else policies are
-    played: a row for each.
-    """
-    evaluation, places = options.evaluation, {p.name: i for i, p in enumerate(policies)}
-
-    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        delays = row.get("delay") or 0, row.get("guidance") or ""
-        return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
-
-    def add(row: dict[str, Any]) -> None:
-        rows.append(row)
-        rows.sort(key=order)
-        write_rows(path, rows)
-
-    path = options.run.out / "results.jsonl"
-    rows = read_lines(path) if path.exists() else []
-    if others := {row["policy"] for row in rows} - places.keys():
-        raise ValueError(
-            f"{path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
-            "with those, or choose another --out"
-        )
-    failures = begin(options, policies)
-    with Jobs(options.run) as jobs:
-        for policy in sorted(policies, key=lambda policy: policy.training.seed):
-            cells = [
-                replace(condition, checkpoint=checkpoint, nfe=nfe)
-                for checkpoint, nfe, condition in product(
-                    policy.training.checkpoint_iterations,
-                    policy.method.nfes(evaluation.nfe),
-                    conditions(policy.method),
-                )
-            ]
-            facts = {cell: (policy.facts | cell.facts()).items() for cell in cells}
-            missing = [cell for cell in cells if not any(facts[cell] <= row.items() for row in rows)]
-            if str(policy) not in failures:
-                submit(jobs, policy, missing, evaluation, add)
-        failures |= jobs.wait()
-    reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
-    if not rows:
-        raise PartialFailure("; ".join(reasons))
-    return pd.DataFrame(rows), reasons
-
-
-def train_all(options: Options, policies: Sequence[Policy]) -> None:
-    """Train what is missing, and play nothing."""
-    failures = begin(options, policies)
-    with Jobs(options.run) as jobs:
-        for policy in policies:
-            jobs.submit(str(policy), train, policy, training=True, status=policy.status)
-        if failures := failures or jobs.wait():
-            raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
-
-
-def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
-    """Write `tasks.json`, and under torchrun train each policy in all processes together; what failed.
-
-    The first process goes on alone.
-    """
-    check_writable(options.run.policies)
-    tasks = {policy.place: policy.task() for policy in policies}.values()
-    text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
-    if not rank():
-        write_atomic(options.run.out / "tasks.json", lambda path: path.write_text(text))
-
-    failures = {}
-    for policy in policies if world_size() > 1 else ():
-        try:
-            train(policy)
-        except (FloatingPointError, ValueError) as error:  # in all processes alike
-            failures[str(policy)] = str(error)
-            print(f"FAILED {policy}: {error}", flush=True)
-    go_on_alone()
-    return failures
-
-
-def submit(
-    jobs: Jobs,
-    policy: Policy,
-    cells: Sequence[Cell],
-    evaluation: Evaluation,
-    add: Callable[[dict[str, Any]], None],
-) -> None:
-    """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
-    last, was_there = policy.training.iterations, policy.is_trained
-    episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
-    measures: dict[int, dict[str, Any]] = {}  # by NFE, of the last checkpoint; others are only played
-
-    def trained(nothing: None) -> None:
-        jobs.say(f"{'found' if was_there else 'trained'} {policy}, {last} iterations")
-
-    def measured(found: dict[int, dict[str, Any]]) -> None:
-        measures.update(found)
-        for cell in [cell for cell in cells if cell.checkpoint == last]:
-            played(cell, [])
-
-    def played(cell: Cell, found: list[Episode]) -> None:
-        mine = episodes[cell]
-        mine += found
-        at_end = cell.checkpoint == last
-        if len(mine) == evaluation.episodes and (measures or not at_end):
-            made = row(policy, cell, mine, measures.get(cell.nfe, {}) if at_end else {})
-            add(made)
-            jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
-
-    group = str(policy)
-    training = {"training": True, "status": policy.status, "then": trained, "group": group}
-    first = jobs.submit(f"train {policy}", train, policy, **training)
-    after = {"after": first, "group": group}
-    if any(cell.checkpoint == last for cell in cells):
-        jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
-    for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
-        more, few = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
-        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, few, **more)
 
 
 @script("robomimic.py", together=True)

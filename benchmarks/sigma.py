@@ -14,13 +14,14 @@ import sys
 from dataclasses import replace
 
 import pandas as pd
-from common import policies_of, trained_actors, write_rows
-from measures import held_out, straightness
-from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
-from paper import paper_success
-from plots import plot_lines
-from report import labelled, per_seed, pooled, table, write_report
-from robomimic import compare
+
+from lab.comparison import compare
+from lab.measures import held_out, straightness
+from lab.options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
+from lab.paper import paper_success
+from lab.plots import plot_lines
+from lab.policies import policies_of, trained_actors, write_rows
+from lab.report import labelled, per_seed, pooled, table, write_report
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 

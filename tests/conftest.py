@@ -47,11 +47,11 @@ def lift_demonstrations(tmp_path_factory):
     pytest.importorskip("robosuite")
     from filelock import FileLock
 
-    from warmprior.data import generate_demonstrations
+    from lab.scripted.generate import generate_demonstrations
 
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    generate = "warmprior.data.scripted.generate"
+    generate = "lab.scripted.generate"
     cache = patch.dict(os.environ, WARMPRIOR_CACHE=str(folder / "demonstrations"))
     with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here), cache:
         return generate_demonstrations("lift", n=3, workers=1)

@@ -114,7 +114,7 @@ def test_see_also_links_to_what_the_reference_has():
 
 
 def test_errors_that_troubleshooting_quotes_exist():
-    code = [*(DOCS.parent / "warmprior").rglob("*.py"), *(DOCS.parent / "benchmarks").glob("*.py")]
+    code = [*(DOCS.parent / "warmprior").rglob("*.py"), *(DOCS.parent / "benchmarks").rglob("*.py")]
     # Literals that stand side by side are one text, and "N" stands for a number that is filled in.
     source = re.sub(r'"\s+f?"', "", "".join(path.read_text() for path in code))
     bold = re.findall(r"\*\*(.*?)\*\*", (DOCS / "troubleshooting.md").read_text(), re.S)

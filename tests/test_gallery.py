@@ -10,7 +10,7 @@ PAGE = (ROOT / "docs" / "gallery.md").read_text()
 FILES = ROOT / "docs" / "_static" / "gallery"
 LIMIT, FILM_LIMIT = 4_000_000, 250_000
 DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|draw)\(|from robomimic import run\b")
-SHARED = ("plots.py", "pictures.py")  # no benchmarks
+SHARED = ()
 
 
 def _drawing() -> dict[str, str]:

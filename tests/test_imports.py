@@ -77,7 +77,7 @@ def test_imports_point_one_way_and_name_nothing_private():
     package = Path(warmprior.__file__).parent
     root = package.parent
     assert {path.parent.name for path in package.glob("*/__init__.py")} == set(ROOMS)
-    scripts = [*root.glob("benchmarks/*.py"), *root.glob("tests/**/*.py")]
+    scripts = [*root.glob("benchmarks/**/*.py"), *root.glob("tests/**/*.py")]
     for path in [*package.glob("*/**/*.py"), *scripts]:
         room = path.relative_to(package).parts[0] if package in path.parents else None
         for module, names in imported(path):

@@ -16,9 +16,8 @@ from warmprior.training.saved import load_policy, save_policy
 pytest.importorskip("robosuite")
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.training import NetworkOptions, TrainingConfig, play_episode, train_policy
+from warmprior.training import NetworkOptions, Task, TrainingConfig, play_episode, train_policy
 from warmprior.training.behaviour_cloning import policy_path
-from warmprior.training.task import robosuite_task
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -35,7 +34,7 @@ def saved(tmp_path_factory):
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
-    task, prior = robosuite_task(path), PastPrior(8)
+    task, prior = Task.from_file(path), PastPrior(8)
     network = NetworkOptions(hidden_dim=16)
     actor = train_policy(task, prior, folder / "policy", network=network, training=training, description=None)
     env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
@@ -104,7 +103,6 @@ def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, mon
             (["info", "me/lift", "--revision", "v2"], "v2"),
             (["push", "me/lift", "me/lift"], "there is no such folder"),
             (["push", str(folder), "lift"], "use user/name"),
-            (["push", str(folder), "me/lift", "--run", str(tmp_path)], "has no results.jsonl"),
         ):
             assert main(argv) == 2
             said = capsys.readouterr().err
@@ -152,13 +150,8 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     ("words", "message"),
     [
         ("--prior nobodys", "unknown prior 'nobodys'"),
-        ("--task tool_hang", "no scripted expert for tool_hang: add --download"),
-        ("--dataset missing.hdf5", "--dataset missing.hdf5: no such file"),
-        ("--encoder small", "--encoder belong to --obs image"),
+        ("--dataset missing.hdf5", "missing.hdf5: no such file"),
         ("--chunk 0", "chunk_length"),
-        ("--observation-keys state", "--observation-keys belongs to --dataset lerobot:"),
-        ("--observation-keys state --dataset lerobot:. --actions absolute", "--demonstrations alone"),
-        ("--observation-keys action --dataset lerobot:.", "and not the action"),
     ],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, message):
@@ -179,11 +172,4 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     actor = load_policy(capsys.readouterr().out.strip())
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
-    assert "cups holds 2" in capsys.readouterr().err
-
-
-def test_demonstrations_replace_no_file(tmp_path, capsys):
-    path = tmp_path / "lift.hdf5"
-    path.write_bytes(b"mine")
-    assert main(["demonstrations", "lift", "--n", "1", "--out", str(path)]) == 2
-    assert f"{path} exists" in capsys.readouterr().err and path.read_bytes() == b"mine"
+    assert "there are 2 demonstrations, fewer than the 3" in capsys.readouterr().err

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from methods import Method
 from tensordict import TensorDict
 from torch import nn
 
+from lab.methods import Method
 from tests.toy_env import Halfway, demonstrations
 from warmprior import (
     FlowMatchingLoss,

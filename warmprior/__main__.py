@@ -6,20 +6,17 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from warmprior.data import lerobot_steps
-from warmprior.data.opening import LEROBOT, name_of_place
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import make
-from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, load_task, train_policy
+from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
 from warmprior.training.behaviour_cloning import policy_path
-from warmprior.training.task import task_places
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -104,7 +101,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def push(args: argparse.Namespace) -> None:
     """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
-    from warmprior.training.card import model_card, policy_results
+    from warmprior.training.card import model_card
     from warmprior.training.saved import check_repository, push_policy
 
     check_repository(args.repository)
@@ -112,8 +109,11 @@ def push(args: argparse.Namespace) -> None:
     if not Path(args.folder).is_dir():
         raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")
     actor = _policy(args)
-    results = policy_results(args.run_folder, args.folder) if args.run_folder else []
-    card = model_card(actor, results, repository=args.repository, licence=args.licence)
+    card = (
+        args.card.read_text()
+        if args.card
+        else model_card(actor, repository=args.repository, licence=args.licence)
+    )
     if args.dry_run:
         print(card)
         return
@@ -127,45 +127,39 @@ class Train:
     """Train a policy on demonstrations, and play nothing.
 
     Attributes:
-        data: what it is trained on.
+        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
         network: the velocity network.
         training: the recipe.
         prior: its source (gaussian, past, preview, or package.module:Class of your own); options follow as in
             past,sigma=0.3.
         chunk: chunk length H.
-        observation_keys: of a LeRobotDataset of any robot: the features that policies see, in this order.
+        task: of robosuite, for a LeRobotDataset that does not describe its environment.
+        style: of the demonstrations, which decides robosuite's time limit.
+        observation_keys: what policies see, in this order (default: the task's).
+        cameras: whose images they see, beside the robot's state.
+        fast_rendering: whether the images are without reflections, shadows and smooth edges.
+        actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
+        mask: a mask of the file, such as train.
+        demonstrations: how many, from the first on (default: all).
         out: folder of the trainings (default: policies); an interrupted one continues.
         device: of the network, such as cuda.
     """
 
-    data: DataOptions
     network: NetworkOptions
     training: TrainingConfig
+    dataset: str = ""
     prior: str = "past"
     chunk: int = 8
-    observation_keys: tuple[str, ...] = ()
+    task: str | None = None
+    style: str = "ph"
+    observation_keys: tuple[str, ...] | None = None
+    cameras: tuple[str, ...] = ()
+    fast_rendering: bool = False
+    actions: Literal["delta", "absolute"] = "delta"
+    mask: str | None = None
+    demonstrations: int | None = None
     out: Path | None = None
     device: str = "cpu"
-
-
-def _tasks(options: Train) -> list[Task]:
-    data, keys = options.data, options.observation_keys
-    if not keys:
-        steps = options.network.observation_steps
-        return [load_task(data, *place, steps) for place in task_places(data)]
-    place = str(data.dataset)
-    if not place.startswith(LEROBOT):
-        raise ValueError("--observation-keys belongs to --dataset lerobot:FOLDER or lerobot:USER/NAME")
-    if replace(data, dataset=None, demonstrations=()) != DataOptions():
-        raise ValueError("--observation-keys goes with --dataset and --demonstrations alone")
-    if "action" in keys or len(set(keys)) < len(keys):
-        raise ValueError(f"--observation-keys names each feature once, and not the action: {' '.join(keys)}")
-    steps = lerobot_steps(place.removeprefix(LEROBOT), keys)
-    if (first := data.first("ph")) is not None:
-        if first > (there := len(steps["episode"].unique())):
-            raise ValueError(f"--demonstrations {first}: {data.dataset} holds {there}")
-        steps = steps[steps["episode"] < first]
-    return [Task.of(name_of_place(place), steps)]
 
 
 def train(args: argparse.Namespace) -> None:
@@ -177,40 +171,36 @@ def train(args: argparse.Namespace) -> None:
         prog="python -m warmprior train",
         description=train.__doc__,
         args=args.options,
-        default=Train(DataOptions(), NetworkOptions(), TrainingConfig()),
+        default=Train(NetworkOptions(), TrainingConfig()),
     )
-    options.network.check(options.data)
     prior = make(Prior, options.prior, options.chunk)
+    if not options.dataset:
+        raise ValueError("name the demonstrations: --dataset FILE, lerobot:FOLDER or lerobot:USER/NAME")
+    task = Task.from_file(
+        options.dataset,
+        task=options.task,
+        style=options.style,
+        observation_steps=options.network.observation_steps,
+        actions=options.actions,
+        observation_keys=options.observation_keys,
+        cameras=options.cameras,
+        fast_rendering=options.fast_rendering,
+        mask=options.mask,
+        demos=options.demonstrations,
+    )
     source = ",".join([prior.name, *options.prior.split(",")[1:]])
-    for task in _tasks(options):
-        name = f"{task.name}-{task.style}-{source}-seed{options.training.seed}"
-        folder = (options.out or Path("policies")) / name
-        train_policy(
-            task,
-            prior,
-            folder,
-            network=options.network,
-            training=options.training,
-            device=options.device,
-            description=name,
-        )
-        print(policy_path(folder, options.training.iterations))
-
-
-def demonstrations(args: argparse.Namespace) -> None:
-    """Generate scripted demonstrations."""
-    from warmprior.data import generate_demonstrations
-
-    options = {"path": args.out, "overwrite": args.overwrite}
-    print(generate_demonstrations(args.task, args.data, args.n, **options))
-
-
-def render(args: argparse.Namespace) -> None:
-    """Render the states of demonstrations to images; continues where it was interrupted."""
-    from warmprior.data import render_demonstrations
-
-    options = {"fast": args.fast, "out": args.out, "workers": args.workers}
-    print(render_demonstrations(args.file, args.cameras, args.size, **options))
+    name = f"{task.name}-{task.style}-{source}-seed{options.training.seed}"
+    folder = (options.out or Path("policies")) / name
+    train_policy(
+        task,
+        prior,
+        folder,
+        network=options.network,
+        training=options.training,
+        device=options.device,
+        description=name,
+    )
+    print(policy_path(folder, options.training.iterations))
 
 
 def convert(args: argparse.Namespace) -> None:
@@ -238,7 +228,11 @@ def make_parser() -> argparse.ArgumentParser:
         add("folder", help=f"written by save_policy, such as .../policy_010000{place}")
         if run is push:
             add("repository", help="user/name; made if needed")
-            add("--run", dest="run_folder", type=Path, help="whose results the card tells")
+            add(
+                "--card",
+                type=Path,
+                help="text of the card, such as benchmarks/card.py writes (default: made here)",
+            )
             add("--private", action="store_true", help="if it is made")
             add("--licence", help="of the policy, as the hub calls it, such as mit")
             add("--dry-run", action="store_true", help="print the card, and send nothing")
@@ -251,7 +245,7 @@ def make_parser() -> argparse.ArgumentParser:
             metavar="MODULE",
             help="where your own prior, start point or network is defined; may be repeated",
         )
-    from warmprior.envs.tasks import EVALUATION_SEED, TASKS
+    from warmprior.envs.tasks import EVALUATION_SEED
 
     add("--episodes", type=int, default=50, help="how many (%(default)s)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
@@ -265,21 +259,6 @@ def make_parser() -> argparse.ArgumentParser:
     added = commands.add_parser("train", help=train.__doc__, add_help=False, prefix_chars="\0")
     added.set_defaults(run=train)
     added.add_argument("options", nargs=argparse.REMAINDER)
-
-    add = command(demonstrations)
-    add("task", choices=[name for name, task in TASKS.items() if task.scripted])
-    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
-    add("--n", type=int, default=200, help="how many (%(default)s)")
-    add("--out", type=Path, help="HDF5 file (default: in the cache)")
-    add("--overwrite", action="store_true", help="replace the file if it is there")
-
-    add = command(render)
-    add("file", type=Path, help="robomimic HDF5 file with states")
-    add("--cameras", nargs="+", help="of the simulator (default: those of the task)")
-    add("--size", type=int, default=84, help="side of the images in pixels (%(default)s)")
-    add("--fast", action="store_true", help="no reflections, shadows and smooth edges")
-    add("--out", type=Path, help="HDF5 file, also FILE itself (default: in the cache)")
-    add("--workers", type=int, help="processes (default: one per core)")
 
     add = command(convert)
     add("file", type=Path, help="robomimic HDF5 file, such as one of scripted demonstrations")

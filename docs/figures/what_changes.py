@@ -15,11 +15,14 @@ import torch
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navigation_positions
-from warmprior.training import navigation_task, play_navigation, train_policy
+from warmprior.training import train_policy
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from navigation1d import NAVIGATION_PRESETS
-from plots import new_figure
+
+from lab.navigation import play_navigation
+from lab.plots import new_figure
+from lab.tasks import navigation_task
 
 OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
 ABOVE, BELOW = "#1f77b4", "#d95f02"

@@ -11,16 +11,20 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from torchrl.envs import TransformedEnv
 
-from warmprior import GaussianPrior, PastPrior, Prior
-from warmprior.diagnostics import SharedObservations, executed_actions
-from warmprior.envs import navigation_demonstrations, navigation_positions
+from warmprior import GaussianPrior, PastPrior, Prior, policy_transforms
+from warmprior.diagnostics import HistoryShift, SharedObservations, executed_actions
+from warmprior.envs import (
+    NavigationEnv,
+    navigation_demonstrations,
+    navigation_metrics,
+    navigation_positions,
+)
 from warmprior.training import (
     NetworkOptions,
+    Task,
     TrainingConfig,
-    judge_navigation,
-    navigation_task,
-    play_navigation,
     train_policy,
 )
 
@@ -121,10 +125,11 @@ recipe = TrainingConfig(
     checkpoints=1,
     cold_probability=0.1,
 )
+task = Task("navigation", "toy", navigation_demonstrations(), NavigationEnv)
 actors = {}
 for name, prior in {"Gaussian": GaussianPrior(4), **priors}.items():
     actors[name] = train_policy(
-        navigation_task(),
+        task,
         prior,
         Path(folder.name) / name,
         network=network,
@@ -132,14 +137,30 @@ for name, prior in {"Gaussian": GaussianPrior(4), **priors}.items():
         description=None,
     )
 
-columns = ("switch_rate", "collision_rate", "distance", "jump_ratio")
-columns += ("shifted_collision_rate",)
-print(f"{'':16}", *(f"{name:>24}" for name in columns))
+
+def play(actor, nfe, rollouts=256, shift=0.0):
+    """Heights of episodes, in which the remembered mean may be disturbed."""
+    transforms = policy_transforms(actor.prior, observation_steps=1)
+    env = TransformedEnv(NavigationEnv(batch_size=[rollouts]), transforms)
+    generator = torch.Generator().manual_seed(0)
+    policy = actor.replace(nfe=nfe, generator=generator)
+    if shift:
+        policy = HistoryShift(policy, shift, generator=generator)
+    with torch.no_grad():
+        played = env.rollout(1000, policy)
+    return executed_actions(played)[0].squeeze(-1)
+
+
+columns = ("switch_rate", "collision_rate", "distance")
+print(f"{'':16}", *(f"{name:>24}" for name in (*columns, "shifted")))
 for name, actor in actors.items():
     for nfe in (9, 1):
-        row = judge_navigation(actor, seed=0, nfe=nfe, rollouts=256)
-        numbers = (f"{row[column]:24.3f}" for column in columns)
-        print(f"{name + ', NFE ' + str(nfe):16}", *numbers)
+        row = navigation_metrics(play(actor, nfe), 4)
+        shifted = navigation_metrics(play(actor, nfe, shift=0.15), 4)
+        numbers = [getattr(row, column) for column in columns]
+        numbers.append(shifted.collision_rate)
+        cells = (f"{number:24.3f}" for number in numbers)
+        print(f"{name + ', NFE ' + str(nfe):16}", *cells)
 
 # %%
 # What to notice: both warm sources keep their side at nine network evaluations per chunk (NFE 9).
@@ -153,8 +174,7 @@ figure, axes = plt.subplots(1, 3, figsize=(10, 2.8), sharey=True)
 for axis, (name, actor), color in zip(
     axes, actors.items(), colors, strict=True
 ):
-    played = play_navigation(actor, seed=0, nfe=1, rollouts=40)
-    heights = executed_actions(played)[0].squeeze(-1)
+    heights = play(actor, nfe=1, rollouts=40)
     for centre in (-0.45, 0.45):
         axis.fill_between(
             [centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8"

@@ -11,6 +11,7 @@ library measures all three. This tutorial does it on the task of :doc:`tutorial 
 
 import matplotlib.pyplot as plt
 import torch
+from torchrl.envs import TransformedEnv
 
 from warmprior import (
     FlowMatchingLoss,
@@ -21,11 +22,20 @@ from warmprior import (
     SourceMoments,
     VelocityMLP,
     WarmPriorActor,
+    policy_transforms,
     window_replay_buffer,
 )
-from warmprior.diagnostics import SharedObservations, curvature, source_leak
-from warmprior.envs import navigation_demonstrations
-from warmprior.training import judge_navigation
+from warmprior.diagnostics import (
+    SharedObservations,
+    curvature,
+    executed_actions,
+    source_leak,
+)
+from warmprior.envs import (
+    NavigationEnv,
+    navigation_demonstrations,
+    navigation_metrics,
+)
 
 torch.manual_seed(0)
 demos = navigation_demonstrations()
@@ -90,13 +100,23 @@ colors = dict(zip(actors, ("#7f7f7f", "#1f77b4", "#d95f02"), strict=True))
 # ``nfe`` is the number of network evaluations per chunk. It is an option of acting, not of
 # training: the same three policies are played with more and fewer.
 
+
+def collision_rate(actor, nfe):
+    transforms = policy_transforms(actor.prior, observation_steps=1)
+    env = TransformedEnv(NavigationEnv(batch_size=[256]), transforms)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        played = env.rollout(
+            1000, actor.replace(nfe=nfe, generator=generator)
+        )
+    heights = executed_actions(played)[0].squeeze(-1)
+    return navigation_metrics(heights, chunk_length=4).collision_rate
+
+
 nfes = [1, 2, 3, 5, 9]
 figure, axis = plt.subplots(figsize=(6, 3.2))
 for name, actor in actors.items():
-    played = [
-        judge_navigation(actor, seed=0, nfe=nfe, rollouts=256) for nfe in nfes
-    ]
-    collisions = [row["collision_rate"] for row in played]
+    collisions = [collision_rate(actor, nfe) for nfe in nfes]
     print(f"{name:16}", [round(rate, 2) for rate in collisions])
     axis.plot(nfes, collisions, "o-", color=colors[name], label=name)
 axis.set(

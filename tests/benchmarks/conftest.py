@@ -21,7 +21,7 @@ class Inline:
         return True
 
     def submit(self, job):
-        import jobs
+        from lab import jobs
 
         future = Future()
         future.set_result(jobs.call(job.function, job.args))
@@ -37,9 +37,8 @@ def inline(request):
     if find_spec("tyro") is None or request.path.name == "test_jobs.py":
         yield
         return
-    import common
-    import jobs
-    import pictures
+    from lab import jobs, pictures
+    from lab import policies as common
 
     with pytest.MonkeyPatch.context() as patch:
         local = jobs.Local

@@ -11,13 +11,13 @@ import torch
 pytest.importorskip("tyro")
 pytest.importorskip("pandas")
 
-import common
-import jobs
 import robomimic
-from common import Cell, play
-from options import PRESETS, parse
 from torchrl.envs import TransformedEnv
 
+from lab import jobs
+from lab import policies as common
+from lab.options import PRESETS, parse
+from lab.policies import Cell, play
 from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
 from tests.benchmarks.drift import DriftEnv, arguments

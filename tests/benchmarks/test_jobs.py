@@ -17,10 +17,9 @@ import pytest
 pytest.importorskip("loky")
 pytest.importorskip("tyro")
 
-import jobs
-from jobs import Jobs
-from options import Run
-
+from lab import jobs
+from lab.jobs import Jobs
+from lab.options import Run
 from tests.processes import apart
 
 
@@ -115,8 +114,8 @@ def test_the_last_trainings_start_before_episodes_and_an_error_kills_the_workers
 
 SLEEP = """
 import sys, time
-from jobs import Jobs
-from options import Run
+from lab.jobs import Jobs
+from lab.options import Run
 from warmprior.io.script import run_script
 def main():
     with Jobs(Run(envs=2)) as pool:

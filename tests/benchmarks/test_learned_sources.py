@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStart, LeapPrior, learn
 from tensordict import TensorDict
 
+from lab.learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStart, LeapPrior, learn
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, window_transforms
 from warmprior.modules import Prior

@@ -11,10 +11,9 @@ import torch
 
 pytest.importorskip("tyro")
 
-import measures
-from measures import measure
-from methods import Method
-
+from lab import measures
+from lab.measures import measure
+from lab.methods import Method
 from tests.benchmarks.drift import ACTION_DIM, OBSERVATION_DIM, task
 from tests.diagnostics.fields import Field, policy
 from tests.diagnostics.test_shared_observations import H, steps

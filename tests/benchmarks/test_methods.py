@@ -6,8 +6,8 @@ import pickle
 
 import pytest
 import torch
-from methods import METHODS, Method
 
+from lab.methods import METHODS, Method
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
 from warmprior.objectives import BridgeCoupling, OTCoupling, ReflowCoupling

@@ -18,8 +18,9 @@ import prior_space_rl
 import real_time_chunking
 import sigma
 from mimicgen_tasks import FEW
-from options import PRESETS, Options, from_record, parse, recorded, started, stored_options, study
-from report import unlike
+
+from lab.options import PRESETS, Options, from_record, parse, recorded, started, stored_options, study
+from lab.report import unlike
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [

@@ -8,10 +8,10 @@ import pytest
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
 
-import plots
 from matplotlib.image import imread
-from report import labelled, per_seed
 
+from lab import plots
+from lab.report import labelled, per_seed
 from tests.benchmarks.test_report import compared, row
 
 

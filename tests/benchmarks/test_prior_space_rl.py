@@ -16,8 +16,8 @@ pytest.importorskip("tyro")
 
 import prior_space_rl as benchmark
 import robomimic
-from options import parse
 
+from lab.options import parse
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.rl import has_anchor
 

@@ -23,10 +23,10 @@ def no_work(monkeypatch):
         raise AssertionError("work was begun")
 
     loaders = ("generate_demonstrations", "download_robomimic")
-    for place in ("common.train_policy", *(f"warmprior.training.task.{name}" for name in loaders)):
+    for place in ("lab.policies.train_policy", *(f"lab.tasks.{name}" for name in loaders)):
         monkeypatch.setattr(place, never)
-    for place in ("training.options.require_rendering", "envs.mimicgen.find_spec"):
-        monkeypatch.setattr(f"warmprior.{place}", lambda *names: None)
+    for place in ("lab.tasks.require_rendering", "warmprior.envs.mimicgen.find_spec"):
+        monkeypatch.setattr(place, lambda *names: None)
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,10 @@ from scipy import integrate, stats
 pytest.importorskip("tyro")
 
 import memory
-import report
 
+from lab import report
+from lab.files import PartialFailure
 from tests.benchmarks.script_parts import is_png
-from warmprior.io.script import PartialFailure
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
 FACTS |= {"seed": 0, "iterations": 100, "checkpoint": 100, "nfe": 1}

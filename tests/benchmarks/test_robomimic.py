@@ -20,10 +20,10 @@ pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
 import navigation1d
-import pictures
 import robomimic
-from options import PRESETS, parse, started
 
+from lab import pictures
+from lab.options import PRESETS, parse, started
 from warmprior.envs import rendering_backend
 from warmprior.training.checkpoint import load_state
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from lab.tasks import DataOptions
 from tests.benchmarks.script_parts import command_line, described, options, stored, written
 from tests.data.synthetic import env_args_14, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
@@ -17,7 +18,7 @@ from tests.processes import apart
 from warmprior import ImageEncoder
 from warmprior.data import DatasetError, RobomimicExperienceReplay, convert_robomimic
 from warmprior.diagnostics import encoded_windows
-from warmprior.training import DataOptions, load_policy
+from warmprior.training import load_policy
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")

@@ -117,7 +117,7 @@ VALUES = {
 IMAGES = {
     "missing camera": (
         lambda root: None,
-        ["no images 'front_image'", "agentview_image", "--images"],
+        ["no images 'front_image'", "agentview_image"],
         "front_image",
     ),
     "not square": (feature(CAMERA, shape=[32, 16, 3]), ["only square"], "agentview_image"),

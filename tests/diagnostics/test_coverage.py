@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
-from learned_sources import CVAEPrior
 
+from lab.learned_sources import CVAEPrior
 from tests.diagnostics.fields import D_A, H, remember, targets
 from warmprior import PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
 from warmprior.diagnostics import source_coverage

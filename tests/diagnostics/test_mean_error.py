@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
-from learned_sources import CVAEPrior, ForecastPrior
 from tensordict import TensorDict
 
+from lab.learned_sources import CVAEPrior, ForecastPrior
 from tests.diagnostics.fields import D_A, H, policy, remember, targets
 from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import mean_error, mean_revision

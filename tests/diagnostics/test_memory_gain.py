@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
-from learned_sources import ForecastPrior, ForecastStart
 
+from lab.learned_sources import ForecastPrior, ForecastStart
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import (
     GaussianPrior,

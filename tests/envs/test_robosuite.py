@@ -13,11 +13,11 @@ pytest.importorskip("robosuite")
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from lab.scripted.motion import ArmRunner
+from lab.scripted.operators import SKILLED, Demonstrator
+from lab.scripted.tasks import EXPERTS
 from tests.data.synthetic import env_args_14
 from tests.processes import apart
-from warmprior.data.scripted.motion import ArmRunner
-from warmprior.data.scripted.operators import SKILLED, Demonstrator
-from warmprior.data.scripted.tasks import EXPERTS
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.tasks import TASKS
 

@@ -7,8 +7,9 @@ import json
 import pytest
 import torch
 
+from lab.machine import check_device
 from tests.together import together
-from warmprior.io.distributed import check_device, launched, leader_first, rank, world_size
+from warmprior.io.distributed import launched, leader_first, rank, world_size
 
 
 @pytest.fixture

@@ -15,8 +15,9 @@ import pytest
 
 pytest.importorskip("loky")
 
+from lab.workers import working
 from tests.processes import ended
-from warmprior.io.workers import WorkerError, working
+from warmprior.io.workers import WorkerError
 
 
 def facts(state):
@@ -71,7 +72,7 @@ def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_a
 
 
 def test_a_dead_process_ends_all_others(tmp_path):
-    said = "one of 2 workers died.*memory.*--envs"
+    said = "one of 2 workers died.*memory.*fewer workers"
     with pytest.raises(WorkerError, match=said) as raised, working(2, None) as call:
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)

@@ -11,8 +11,9 @@ pytest.importorskip("scipy")
 from scipy import stats
 
 import warmprior
+from lab.report import policy_results
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-from warmprior.training import model_card, policy_results
+from warmprior.training import model_card
 
 ACTOR = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
 FACTS = {

@@ -14,7 +14,6 @@ pytest.importorskip("robosuite")
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_description, environment_of
 from warmprior.envs.simulator import task_env_args
-from warmprior.training import film
 
 
 def test_frames_are_of_the_evaluated_episode(monkeypatch):
@@ -29,7 +28,7 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
         return np.zeros((size, size, 3), dtype=np.uint8)
 
     monkeypatch.setattr(RobosuiteEnv, "render_frame", render)
-    monkeypatch.setattr(film, "require_rendering", lambda: None)
+    monkeypatch.setattr("warmprior.envs.rendering.require_rendering", lambda: None)
     strips = {
         (seed, policy_seed): record_filmstrip(
             actor, seed=seed, nfe=2, policy_seed=policy_seed, frames=3, horizon=20

@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 import torch
-from learned_sources import ForecastPrior
 from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from lab.learned_sources import ForecastPrior
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training
 from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.training import precondition

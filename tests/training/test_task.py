@@ -10,18 +10,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from lab.tasks import DataOptions, load_task, read_like
 from tests.data.synthetic import write_robomimic_file
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend
-from warmprior.training import (
-    DataOptions,
-    NetworkOptions,
-    Task,
-    TrainingConfig,
-    load_task,
-)
-from warmprior.training import task as module
-from warmprior.training.task import read_like, robosuite_task
+from warmprior.training import NetworkOptions, Task, TrainingConfig
+from warmprior.training.files import opened
 from warmprior.training.train import new_policy
 from warmprior.transforms import AbsoluteActions
 
@@ -101,7 +95,7 @@ def path(tmp_path_factory):
 
 
 def in_both_spaces(path):
-    return [robosuite_task(path, options=DataOptions(actions=a)) for a in ("delta", "absolute")]
+    return [Task.from_file(path, actions=a) for a in ("delta", "absolute")]
 
 
 def test_absolute_actions_have_the_units_of_deltas(path):
@@ -123,16 +117,14 @@ def test_absolute_actions_have_the_units_of_deltas(path):
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 
-    whole, part, all_ = (
-        robosuite_task(path, options=DataOptions(demonstrations=n)) for n in ((), (1,), (2,))
-    )
+    whole, part, all_ = (Task.from_file(path, demos=n) for n in (None, 1, 2))
     assert all_.identity == whole.identity != part.identity  # other policies, of the same file
     assert part.facts["sha256"] == whole.facts["sha256"]
     assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
     mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
     assert torch.allclose(mine, theirs[:30], atol=1e-6)
     with pytest.raises(DatasetError, match="there are 2 demonstrations, fewer than the 3"):
-        robosuite_task(path, options=DataOptions(demonstrations=(3,)))
+        Task.from_file(path, demos=3)
 
 
 def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
@@ -153,13 +145,12 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     from warmprior.data import convert_robomimic
 
     folder = convert_robomimic(path, tmp_path / "lift")
-    file, theirs = (robosuite_task(p, options=DataOptions(("lift",))) for p in (path, f"lerobot:{folder}"))
+    file, theirs = (Task.from_file(p, task="lift") for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity
     (folder / "meta" / "warmprior.json").unlink()  # as from another converter
     for actions, width in (("delta", 7), ("absolute", 10)):
-        options = DataOptions(("lift",), actions=actions)
-        named = robosuite_task(f"lerobot:{folder}", options=options)
+        named = Task.from_file(f"lerobot:{folder}", task="lift", actions=actions)
         assert named.data["action"].shape[-1] == width
         assert named.environment["robosuite"]["env_args"]["env_name"] == "Lift"
-    assert module._open(f"lerobot:{folder}", "lift").name == "lerobot:lift"
+    assert opened(f"lerobot:{folder}", "lift").name == "lerobot:lift"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from lab.tasks import navigation_task
 from warmprior import PastPrior
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)

@@ -63,7 +63,7 @@ def convert_robomimic(
         >>> convert_robomimic("nowhere.hdf5", "out")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path, ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     path, folder = Path(path), Path(folder).expanduser()
     if images not in (None, *KINDS):
@@ -72,14 +72,12 @@ def convert_robomimic(
     if images:
         keys = [f"{camera}_image" for camera in index.cameras]
         if not keys:
-            raise DatasetError(
-                f"{path} has no images: render them first (python -m warmprior render {path} --out FILE)"
-            )
+            raise DatasetError(f"{path} has no images: render them first, or leave images out")
         index = read_index(path, demos=demos, image_keys=keys)
         if images == "video" and index.image_size < VIDEO_SIZE:
             raise ValueError(
                 f"{path}: images of {index.image_size} pixels are too small for a video, which takes "
-                f"{VIDEO_SIZE}: write pictures (--images), or render larger ones"
+                f"{VIDEO_SIZE}: write pictures (images='image'), or render larger ones"
             )
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} exists: choose another folder, or remove it to convert anew")

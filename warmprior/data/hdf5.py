@@ -164,7 +164,7 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
     h5py = require("h5py", "sim")
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; check the path, or fetch it (download_robomimic)")
+        raise FileNotFoundError(f"{path}: no such file; check the path")
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -296,8 +296,7 @@ def _image_sizes(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) 
         if images is None:
             known = ", ".join(k for k in names(demo["obs"]) if k.endswith("_image")) or "none"
             raise DatasetError(
-                f"{path}: {name} has no images {key!r}; it has {known}. Choose other cameras, or render "
-                f"them: python -m warmprior render {path} --cameras {key.removesuffix('_image')}"
+                f"{path}: {name} has no images {key!r}; it has {known}. Choose other cameras, or render them"
             )
         shape: tuple[int, ...] = images.shape or ()
         wrong = ""
@@ -310,7 +309,7 @@ def _image_sizes(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) 
         if wrong:
             raise DatasetError(
                 f"{path}: {name}/obs/{key} has shape {shape} and type {images.dtype}; {wrong}. Render them "
-                "anew: python -m warmprior render"
+                "anew"
             )
         sizes[shape[1]] = f"{name}/obs/{key}"
     return sizes

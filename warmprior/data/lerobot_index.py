@@ -356,7 +356,7 @@ def _image_size(
             known = ", ".join(f"{k} ({name})" for k, name in cameras.items()) or "none"
             raise DatasetError(
                 f"{root}: there are no images {key!r}; there are {known}. Choose other cameras, or render "
-                "them into a robomimic file (python -m warmprior render) and convert that with --images"
+                "them into a robomimic file, and convert that with its images"
             )
         shape = tuple(features[cameras[key]]["shape"])
         side = max(shape)

@@ -1,4 +1,4 @@
-"""robomimic's and MimicGen's demonstrations: the official files, and a TorchRL replay buffer of any file."""
+"""robomimic's and MimicGen's demonstrations: a TorchRL replay buffer of any file."""
 
 from __future__ import annotations
 
@@ -7,105 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
-from warmprior.data.replay import DatasetError, DemonstrationReplay
-from warmprior.envs.mimicgen import is_mimicgen
-from warmprior.envs.tasks import TASKS
-from warmprior.io.extras import require
-from warmprior.io.files import file_digest
-
-REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
-"""The hub's dataset repositories that hold robomimic's files, in the order of trying."""
-
-MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
-"""The one that holds MimicGen's, under the licence CC BY-NC-SA 4.0."""
-
-
-def download_robomimic(
-    task: str, style: str | None = None, *, root: str | Path | None = None, force: bool = False
-) -> Path:
-    """Download an official low-dimensional file of robomimic or MimicGen, unless it is there already.
-
-    robomimic's is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
-    delivers it, and MimicGen's ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
-    :data:`MIMICGEN_REPOSITORY`, whose licence, CC BY-NC-SA 4.0, excludes commercial use. The file, whose path
-    is returned, is opened and compared with the digest that the hub gives, where that can be reached; one
-    that fails is fetched once more.
-
-    Args:
-        task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``; ``stack_d0``, ``coffee_d0`` or
-            ``threading_d0`` of MimicGen.
-        style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators); of MimicGen ``"source"`` (ten
-            human demonstrations) or ``"core"`` (a thousand that MimicGen made of them). The former by
-            default.
-        root: the folder under which to keep the file; by default the hub client's cache.
-        force: download again even if the file is there.
-
-    Raises:
-        ValueError: if there is no official file of the task or style.
-        OSError: if no repository delivers a readable file; names every attempt and its cause.
-
-    Examples:
-        >>> from warmprior.data import download_robomimic
-        >>> download_robomimic("square", "mh")  # doctest: +SKIP
-        PosixPath('.../v1.5/square/mh/low_dim_v15.hdf5')
-        >>> download_robomimic("tool_hang", "mh")
-        Traceback (most recent call last):
-            ...
-        ValueError: tool_hang has no official 'mh' data; it has: ph
-    """
-    official = {name: spec.official for name, spec in TASKS.items() if spec.official}
-    if task not in official:
-        raise ValueError(f"no official data for task {task!r}; choose one of {', '.join(official)}")
-    style = official[task][0] if style is None else style
-    if style not in official[task]:
-        raise ValueError(f"{task} has no official {style!r} data; it has: {', '.join(official[task])}")
-    if not is_mimicgen(TASKS[task].env_name):
-        return _download(f"v1.5/{task}/{style}/low_dim_v15.hdf5", REPOSITORIES, root, force)
-    # The human demonstrations belong to the task, those made of them to a variant of it.
-    name = task.removesuffix("_d0") if style == "source" else task
-    return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, force)
-
-
-def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
-    """Fetch and check a file of the first repository that delivers it."""
-    hub = require("huggingface_hub", "sim")
-    require("h5py", "sim")
-    failures: list[str] = []
-    for repository in repositories:
-        where = {"repo_id": repository, "filename": name, "repo_type": "dataset"}
-        for anew in dict.fromkeys((force, True)):  # a damaged copy is fetched once more
-            try:
-                path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
-                published = _published_digest(hub, where)
-                if published is not None and file_digest(path) != published:
-                    raise DatasetError(
-                        f"{path}: its sha256 is not the {published} that the hub publishes: it was damaged "
-                        "on the way or on this disk"
-                    )
-                with open_robomimic(path):
-                    return path
-            # The client's failures share no base class: its own errors, those of the HTTP library
-            # underneath, and OSError for a broken connection, a full disk or a short file.
-            except Exception as error:
-                cause = error
-                if not isinstance(error, DatasetError):
-                    break
-        failures.append(f"{repository}: {type(cause).__name__}: {str(cause).strip() or 'no message'}")
-    raise OSError(
-        f"could not download {name}:\n- "
-        + "\n- ".join(failures)
-        + "\nCheck the connection; force=True replaces a broken local copy, and a file fetched by "
-        "other means can be given by its path."
-    ) from cause
-
-
-def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
-    """SHA-256 of a file at the hub; ``None`` if the hub cannot be reached or gives another kind."""
-    try:
-        etag = hub.get_hf_file_metadata(hub.hf_hub_url(**where)).etag
-    except Exception:  # without a connection, what is there has to do
-        return None
-    return etag if etag is not None and len(etag) == 64 else None
+from warmprior.data.replay import DemonstrationReplay
 
 
 class RobomimicExperienceReplay(DemonstrationReplay):
@@ -125,7 +27,7 @@ class RobomimicExperienceReplay(DemonstrationReplay):
     Names, shapes and masks are checked before values are read.
 
     Args:
-        path: an HDF5 file, such as one of :func:`warmprior.data.download_robomimic`.
+        path: an HDF5 file.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: how many to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
@@ -153,7 +55,7 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         >>> RobomimicExperienceReplay("nowhere.hdf5")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path, or fetch it (download_robomimic)
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
     def __init__(

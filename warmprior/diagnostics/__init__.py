@@ -3,7 +3,7 @@
 from warmprior.diagnostics.curvature import branching_bound, branching_cost, curvature, flow_paths
 from warmprior.diagnostics.errors import MeanError, action_error, mean_error, mean_revision, source_coverage
 from warmprior.diagnostics.flow import SharedObservations, encoded_windows
-from warmprior.diagnostics.leaks import SourceLeak, memory_gain, source_leak
+from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, memory_gain, source_leak
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
 from warmprior.diagnostics.statistics import (
     bootstrap_ratio,
@@ -14,6 +14,7 @@ from warmprior.diagnostics.statistics import (
 )
 
 __all__ = [
+    "HistoryShift",
     "MeanError",
     "SharedObservations",
     "Smoothness",

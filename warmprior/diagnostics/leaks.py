@@ -327,9 +327,31 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
 
 
 class HistoryShift(TensorDictModuleBase):
-    """Adds normal noise of deviation ``std`` to a policy's history, actions and forecast, at every decision.
+    """Adds normal noise to the history that a policy reads, actions and forecast, at every decision.
 
-    The environment's own history stays as it is. A ``ValueError`` if ``std < 0``.
+    The environment's own history stays as it is.
+
+    Args:
+        policy: the policy.
+        std: deviation of the noise, in normalised action units.
+        generator: source of randomness; PyTorch's global one by default.
+
+    Raises:
+        ValueError: if ``std < 0``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import HistoryShift
+        >>> from warmprior.history import window_history
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4, observation_steps=1), PastPrior(4, sigma=0.0))
+        >>> zeros, steps = torch.zeros(5, 4, 2), torch.full((5, 1), 4)
+        >>> data = TensorDict({"observation": torch.zeros(5, 1, 3),
+        ...                    "history": window_history(zeros, steps, zeros, chunk_length=4)}, [5])
+        >>> shifted = HistoryShift(actor, 0.1)(data)["prior", "loc"]
+        >>> bool(shifted.any()), bool(data["history", "actions"].any())
+        (True, False)
     """
 
     def __init__(

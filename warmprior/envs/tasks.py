@@ -33,8 +33,6 @@ class TaskSpec:
         horizon_mh: time limit in control steps for six-operator (``mh``) data.
         object_dim: width of the ``object`` observation.
         cameras: the cameras of robomimic's image files, third person first.
-        scripted: whether a scripted expert exists.
-        official: the styles of the data that robomimic or MimicGen publish for the task.
 
     Examples:
         >>> from warmprior.envs import TaskSpec
@@ -50,8 +48,6 @@ class TaskSpec:
     horizon_mh: int
     object_dim: int
     cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
-    scripted: bool = True
-    official: tuple[str, ...] = ("ph", "mh")
 
     @property
     def low_dim_keys(self) -> tuple[str, ...]:
@@ -85,7 +81,7 @@ TASKS: dict[str, TaskSpec] = {
         TaskSpec("lift", "Lift", 1, 400, 500, 10),
         TaskSpec("can", "PickPlaceCan", 1, 400, 500, 14),
         TaskSpec("square", "NutAssemblySquare", 1, 400, 500, 14),
-        TaskSpec("stack", "Stack", 1, 400, 500, 23, official=()),
+        TaskSpec("stack", "Stack", 1, 400, 500, 23),
         TaskSpec(
             "transport",
             "TwoArmTransport",
@@ -103,11 +99,9 @@ TASKS: dict[str, TaskSpec] = {
             700,
             44,
             cameras=("sideview", "robot0_eye_in_hand"),
-            scripted=False,
-            official=("ph",),
         ),
         *(
-            TaskSpec(name, env_name, 1, 400, 400, width, scripted=False, official=("source", "core"))
+            TaskSpec(name, env_name, 1, 400, 400, width)
             for name, env_name, width in (
                 ("stack_d0", "Stack_D0", 23),
                 ("coffee_d0", "Coffee_D0", 57),

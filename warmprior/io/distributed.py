@@ -135,31 +135,10 @@ def check_batch(size: int) -> None:
         >>> check_batch(0)
         Traceback (most recent call last):
             ...
-        ValueError: --batch-size 0 cannot be divided among 1 process(es): choose a multiple of 1
+        ValueError: batch_size 0 cannot be divided among 1 process(es): choose a multiple of 1
     """
     count = world_size()
     if size < count or size % count:
         raise ValueError(
-            f"--batch-size {size} cannot be divided among {count} process(es): choose a multiple of {count}"
+            f"batch_size {size} cannot be divided among {count} process(es): choose a multiple of {count}"
         )
-
-
-def check_device(device: str) -> None:
-    """Refuse a device, such as ``"cuda"`` for one each, that not every process here has, or that fails."""
-    try:
-        if torch.device(device).type == "cuda" and launched():
-            local, devices = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
-            if torch.device(device).index is not None:
-                raise ValueError(
-                    f"--device {device}: under torchrun every process takes a GPU of its own: --device cuda"
-                )
-            if local > devices:
-                raise ValueError(
-                    f"--device {device}: {local} processes on a machine with {devices} CUDA device(s): start "
-                    f"torchrun with --nproc-per-node {devices}"
-                )
-        # Computed and read: there are devices that can only be named, such as meta.
-        torch.ones(1, device=device).add(1).item()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"--device {device} does not work here: {reason}") from error

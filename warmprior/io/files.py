@@ -98,22 +98,6 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read a file of JSON objects, one per line; a ``ValueError`` that names the line that is damaged."""
-    check_regular(path)
-    records = []
-    for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        try:
-            records.append(json.loads(line))
-            if not isinstance(records[-1], dict):
-                raise ValueError("it is no JSON object")
-        except (ValueError, RecursionError) as error:
-            raise ValueError(
-                f"{path}, line {number} is damaged ({error}): remove that line, and continue with --resume"
-            ) from error
-    return records
-
-
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
@@ -214,8 +198,3 @@ def exclusive(directory: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
-
-
-def cache_folder() -> Path:
-    """Where generated files are kept: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
-    return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

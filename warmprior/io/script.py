@@ -14,12 +14,7 @@ import torch
 from warmprior.io.distributed import joined, launched, rank
 from warmprior.io.workers import WorkerError
 
-
-class PartialFailure(RuntimeError):
-    """Some of the work failed; the rest of it is done and written down."""
-
-
-ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError, PartialFailure)
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
 """What a user can mend: reported without a traceback."""
 
 

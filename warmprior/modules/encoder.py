@@ -214,7 +214,7 @@ def imagenet_weights() -> dict[str, Tensor]:
         raise OSError(
             f"ImageNet's weights of ResNet-18 cannot be had ({reason}): connect once, put an intact "
             f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints, or start from random "
-            "weights (--encoder resnet18)"
+            "weights (encoder='resnet18')"
         ) from error
 
 

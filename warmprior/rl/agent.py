@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.modules import ProbabilisticActor, TanhNormal
@@ -115,6 +115,25 @@ class PriorSpaceConfig:
         if self.delta is not None:
             return self.delta
         return 0.5 if has_anchor(actor) else 1.5
+
+
+class WarmUpSwitch(TensorDictModuleBase):
+    """Acts by ``warmup``, and by ``policy`` once ``learning`` is set.
+
+    That is a buffer, bool ``[]``, which collectors receive with the weights.
+    """
+
+    def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = policy.in_keys, [keys.DELTA, keys.CHUNK]
+        self.warmup, self.policy = warmup, policy
+        self.learning: torch.Tensor
+        self.register_buffer("learning", torch.zeros((), dtype=torch.bool))
+
+    def forward(self, data: TensorDictBase) -> TensorDictBase:
+        """Write a residual and its chunk."""
+        decided = (self.policy if self.learning else self.warmup)(data.copy())
+        return data.update(decided.select(*self.out_keys))
 
 
 class PriorSpaceAgent:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,8 @@ from warmprior import keys
 from warmprior.io.files import read_tensors, save_file, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite
-from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig
+from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate, watched
 
@@ -97,9 +96,9 @@ class PriorSpaceTraining:
         directory: the folder.
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
-        collectors: how many actors of a Ray cluster collect, each with its own environments; by default this
-            process collects. Another number means other episodes.
-        ray_address: of the cluster.
+        collect: collects elsewhere, called as ``collect(policy, make_env, num_envs=n, seed=seed)``: a context
+            manager that yields rounds of decisions, a TensorDict ``[..., n, 1]`` each. By default this
+            process collects.
 
     Attributes:
         agent (PriorSpaceAgent): what learns; its ``policy`` is the agent followed by the decoder.
@@ -141,11 +140,10 @@ class PriorSpaceTraining:
         *,
         evaluation_seed: int,
         description: str | None = None,
-        collectors: int | None = None,
-        ray_address: str | None = None,
+        collect: Callable[..., AbstractContextManager[Iterator[TensorDictBase]]] | None = None,
     ) -> None:
         self.actor, self.make_env, self.config = actor, make_env, config
-        self.collectors, self.ray_address = collectors, ray_address
+        self.collect = collect
         self.directory = Path(directory)
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
@@ -235,19 +233,12 @@ class PriorSpaceTraining:
     @contextmanager
     def _rounds(self, num_envs: int) -> Iterator[Iterator[int]]:
         """Collect decisions of all environments; yields the control steps of each round."""
-        if self.collectors is None:
+        if self.collect is None:
             with self._environment(self._seed()) as env:
                 yield self._collected(env)
             return
         policy = WarmUpSwitch(self.agent.warmup, self.agent.policy)
-        with ray_rounds(
-            policy,
-            self.make_env,
-            collectors=self.collectors,
-            num_envs=num_envs,
-            seed=self._seed(),
-            address=self.ray_address,
-        ) as rounds:
+        with self.collect(policy, self.make_env, num_envs=num_envs, seed=self._seed()) as rounds:
             yield self._received(rounds, policy)
 
     def _collected(self, env: EnvBase) -> Iterator[int]:

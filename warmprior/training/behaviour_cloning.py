@@ -247,7 +247,7 @@ class BehaviourCloning:
             self._restore()  # what another process did since this object was built
             if from_leader(lambda: self.iteration) != self.iteration:
                 raise OSError(
-                    f"the processes read different states at {self.state_path}: give --out a folder that all "
+                    f"the processes read different states at {self.state_path}: choose a directory that all "
                     "machines share"
                 )
             try:

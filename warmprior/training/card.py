@@ -5,57 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from warmprior.diagnostics.statistics import success_posterior
-from warmprior.envs.description import environment_name
 from warmprior.io.extras import require
-from warmprior.io.files import read_json, read_lines
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.saved import policy_config
-
-
-def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
-    """The rows of a run's results that one of its policies played, with the facts of its demonstrations.
-
-    ``run`` is the folder of a benchmark, ``policy`` such as ``.../policies/lift-ph-.../policy_005000``.
-
-    Raises:
-        FileNotFoundError: if there are no results.
-        ValueError: if they are damaged, or none is of the policy.
-
-    Examples:
-        >>> import json
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> from warmprior.training import policy_results
-        >>> row = {"task": "lift", "data": "ph", "policy": "lift-ph", "checkpoint": 20, "success_rate": 0.5}
-        >>> with TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "results.jsonl").write_text(json.dumps(row))
-        ...     policy_results(folder, "policies/lift-ph/policy_000020")[0]["success_rate"]
-        0.5
-    """
-    path, folder = Path(run) / "results.jsonl", Path(policy).resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"{run} has no results.jsonl: name the folder of a finished run")
-    rows = [
-        row
-        for row in read_lines(path)
-        if "success_rate" in row
-        and row.get("policy") == folder.parent.name
-        and f"policy_{row['checkpoint']:06d}" == folder.name
-    ]
-    if not rows:
-        raise ValueError(
-            f"{path} has no row of {folder}: name the run that played it, and the policy where that run "
-            "keeps it"
-        )
-    tasks = Path(run) / "tasks.json"
-    for facts in read_json(tasks) if tasks.is_file() else ():
-        if (facts["task"], facts["data"]) == (rows[0]["task"], rows[0]["data"]):
-            rows = [{**row, "demonstrations": facts} for row in rows]
-    return rows
 
 
 def model_card(
@@ -69,7 +24,8 @@ def model_card(
 
     Args:
         actor: the policy.
-        results: what a run says of it, see :func:`policy_results`.
+        results: a row per way of playing it, with ``task``, ``data``, ``seed``, ``checkpoint``,
+            ``iterations``, ``nfe``, ``episodes``, ``successes``, and ``demonstrations``, facts of them.
 
     Keyword Args:
         repository: where the policy will lie.
@@ -88,6 +44,8 @@ def model_card(
         license=licence,
         tags=["robotics", "imitation-learning", "flow-matching", "torchrl", "warmprior"],
     )
+    from warmprior.envs.description import environment_name
+
     task = results[0]["task"] if results else environment_name(actor)
     parts = [
         f"---\n{data.to_yaml()}\n---",
@@ -150,6 +108,8 @@ def _success(results: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _use(actor: WarmPriorActor, repository: str) -> str:
+    from warmprior.envs.description import environment_name
+
     own = [
         f"{type(part).__name__} of {type(part).__module__}"
         for part in (actor.prior, actor.network)

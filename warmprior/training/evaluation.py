@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.io.workers import end_with_parent, start_method, torch_threads, worker_died
+from warmprior.training.task import Task
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """Writes the next chunk."""
@@ -291,7 +292,7 @@ def play_episode(
 
 def evaluate(
     policy: TensorDictModuleBase,
-    env: EnvBase,
+    env: EnvBase | Task,
     *,
     episodes: int,
     first_seed: int,
@@ -308,13 +309,13 @@ def evaluate(
     Args:
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
             followed by a :class:`~warmprior.PriorDecoder`; set to evaluation mode.
-        env: an environment with the policy's transforms. A single one plays the episodes one after
-            another, see :func:`play_episode`. A batched one ``[n]`` plays ``n`` at a time, and the noise that
-            an episode meets depends on ``n``: that of :func:`parallel_env`, any ``SerialEnv`` or
-            ``ParallelEnv`` (each of whose environments is seeded by itself, and has to start the same
-            episode after every ``set_seed(seed)``), or one whose class says ``strided_seeds = True``: after
-            ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed + i``,
-            ``seed + i + n``, ...
+        env: a :class:`Task`; or an environment with the policy's transforms. A single one plays the
+            episodes one after another, see :func:`play_episode`. A batched one ``[n]`` plays ``n`` at a
+            time, and the noise that an episode meets depends on ``n``: that of :func:`parallel_env`, any
+            ``SerialEnv`` or ``ParallelEnv`` (each of whose environments is seeded by itself, and has to
+            start the same episode after every ``set_seed(seed)``), or one whose class says ``strided_seeds
+            = True``: after ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed +
+            i``, ``seed + i + n``, ...
 
     Keyword Args:
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
@@ -348,6 +349,9 @@ def evaluate(
         >>> [episode.seed for episode in played]
         [100, 101, 102, 103, 104, 105]
     """
+    if isinstance(env, Task):
+        success, measures = env.success, env.measures
+        env = env.env(policy)  # type: ignore[arg-type]
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     if len(env.batch_size) > 1:

@@ -12,8 +12,6 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from warmprior.envs.description import environment_of
-from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, write_atomic
 from warmprior.keys import SUCCESS
@@ -145,6 +143,9 @@ def record_filmstrip(
     quick: Callable[[Any, int], np.ndarray]
     frame = quick = _resized
     if env is None:
+        from warmprior.envs.description import environment_of
+        from warmprior.envs.rendering import EnvRenderers, require_rendering
+
         require_rendering()
         env = environment_of(actor, **options)
         simulator, loop = env.base_env, env.base_env.loop
@@ -174,6 +175,8 @@ def record_filmstrip(
 
 def check_video(path: Path) -> None:
     """Refuse, before any episode, a film that could not be written here or has another ending than .mp4."""
+    from warmprior.envs.rendering import require_rendering
+
     if path.suffix != ".mp4":
         raise ValueError(f"{path} must end in .mp4: films have no other format")
     require("av", "lerobot")

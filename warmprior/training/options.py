@@ -1,17 +1,11 @@
-"""What a training is asked for: data, network and recipe, as a command line has them."""
+"""What a training is asked for: the network and the recipe."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
-from warmprior.data.opening import check_place
-from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
-from warmprior.envs.rendering import require_rendering
-from warmprior.envs.tasks import get_task
-from warmprior.io.extras import require
 from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
@@ -22,11 +16,8 @@ from warmprior.modules import (
     VisionNetwork,
 )
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.modules.encoder import imagenet_weights, load_imagenet
+from warmprior.modules.encoder import load_imagenet
 from warmprior.objectives.flow_matching import Objective, TimesName, Weighting, check_objective
-
-GENERATED = 150
-"""Scripted demonstrations, where no other number is asked for."""
 
 PRETRAINED = "resnet18-imagenet"
 
@@ -36,130 +27,6 @@ _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "chi_transformer": (ChiTransformer, "embedding_dim"),
     "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
 }
-
-
-def is_simulated(task: str) -> bool:
-    """Whether a task is one of robosuite: not the toy, and not one of a user's own."""
-    return task != "navigation" and ":" not in task
-
-
-def check_counts(options: Any, *names: str) -> None:
-    """Refuse options of a dataclass that are no whole numbers of at least 1; ``None`` is fine."""
-    for name in names:
-        value = getattr(options, name)
-        for count in value if isinstance(value, tuple) else (value,):
-            if count is not None:
-                check_whole_numbers(**{f"--{name.replace('_', '-')}": count})
-
-
-@dataclass(frozen=True)
-class DataOptions:
-    """What policies are trained on.
-
-    Attributes:
-        task: manipulation tasks (default: square, or the dataset's); or one of your own, as
-            package.module:function, which is given these options and returns a Task.
-        data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
-            the source).
-        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
-            Instead of generated data.
-        download: fetch the official files from the hub instead.
-        force_download: fetch them again, in place of a broken local copy.
-        mask: name of a mask in the file, such as train; only its demonstrations are used.
-        demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
-            numbers for ph and mh.
-        actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
-        obs: what policies see: the state of robot and objects, or that of the robot and images.
-        cameras: of the images; by default the task's two, or four with two arms.
-        image_size: side of the images in pixels.
-        fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
-
-    Examples:
-        >>> from warmprior.training import DataOptions
-        >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
-        >>> options.count("ph"), options.count("mh"), options.generated
-        (20, 60, True)
-    """
-
-    task: tuple[str, ...] = ()
-    data: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
-    dataset: Path | None = None
-    download: bool = False
-    force_download: bool = False
-    mask: str | None = None
-    demonstrations: tuple[int, ...] = ()
-    actions: Literal["delta", "absolute"] = "delta"
-    obs: Literal["state", "image"] = "state"
-    cameras: tuple[str, ...] = ()
-    image_size: int = 84
-    fast_rendering: bool = False
-
-    def __post_init__(self) -> None:
-        check_counts(self, "demonstrations", "image_size")
-        if len(self.demonstrations) > 2:
-            raise ValueError(
-                f"--demonstrations takes one number, or one for ph and one for mh, got {self.demonstrations}"
-            )
-
-    def check(self) -> None:
-        """Refuse options that cannot work, naming them, before anything is generated or downloaded.
-
-        Raises:
-            ValueError: for options that contradict each other.
-            FileNotFoundError: if the file does not exist.
-            ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
-        """
-        if self.force_download and not self.download:
-            raise ValueError("--force-download belongs to --download")
-        if self.mask is not None and self.generated:
-            raise ValueError("--mask is that of a file: add --download, or --dataset FILE")
-        if self.obs == "image":
-            try:
-                require_rendering()
-            except RuntimeError as error:
-                raise ValueError(f"--obs image needs the simulator's images: {error}") from error
-            if self.actions == "absolute":
-                raise ValueError("--obs image goes with --actions delta, as in the paper")
-            if len(set(self.cameras)) < len(self.cameras):
-                raise ValueError(f"--cameras names one twice: {' '.join(self.cameras)}")
-        elif self.cameras or self.fast_rendering:
-            raise ValueError("--cameras and --fast-rendering belong to --obs image")
-        if self.dataset is not None:
-            if self.download:
-                raise ValueError("--dataset reads a file: leave out --download")
-            if len(self.task) > 1 or len(self.data) > 1:
-                raise ValueError("--dataset is of one task and style: name at most one --task and --data")
-            if len(self.demonstrations) > 1:
-                raise ValueError(
-                    f"--demonstrations takes one number with --dataset, got {self.demonstrations}"
-                )
-            check_place(self.dataset, "--dataset")
-        for task in filter(is_simulated, self.task):
-            if self.generated and not get_task(task).scripted:
-                raise ValueError(
-                    f"there is no scripted expert for {task}: add --download for the official data, or "
-                    "--dataset FILE"
-                )
-            if self.download and is_mimicgen(get_task(task).env_name):
-                find_mimicgen()
-        for style in self.data if self.generated else ():
-            if style not in ("ph", "mh"):
-                raise ValueError(
-                    f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
-                )
-
-    @property
-    def generated(self) -> bool:
-        """Whether scripted experts make the data."""
-        return self.dataset is None and not self.download
-
-    def first(self, style: str) -> int | None:
-        """Demonstrations to take of a file of a style; ``None`` for all of it."""
-        return self.demonstrations[-1 if style == "mh" else 0] if self.demonstrations else None
-
-    def count(self, style: str) -> int:
-        """Scripted demonstrations of a style."""
-        return self.first(style) or GENERATED
 
 
 @dataclass(frozen=True)
@@ -195,27 +62,10 @@ class NetworkOptions:
     share_encoder: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, "hidden_dim", "observation_steps", "crop_size")
+        counts = ("hidden_dim", "observation_steps", "crop_size")
+        check_whole_numbers(**{n: value for n in counts if (value := getattr(self, n)) is not None})
         if self.network not in _NETWORKS:
-            raise ValueError(f"--network must be one of {', '.join(_NETWORKS)}, got {self.network!r}")
-
-    def check(self, data: DataOptions) -> None:
-        """Refuse options of images that cannot work, or have no effect, and weights that cannot be had."""
-        if data.obs == "state":
-            usual = self.without_images() == self or self.encoder == "resnet18"
-            if not usual or data.image_size != DataOptions().image_size:
-                raise ValueError(
-                    "--image-size, --crop-size, --share-encoder and --encoder belong to --obs image"
-                )
-            return
-        if not 8 <= self.crop_size <= data.image_size:
-            raise ValueError(
-                f"--crop-size {self.crop_size} must be at least 8 and at most --image-size {data.image_size}"
-            )
-        if self.encoder == PRETRAINED:
-            imagenet_weights()
-        elif self.encoder != "small":
-            require("torchvision", "vision")
+            raise ValueError(f"network must be one of {', '.join(_NETWORKS)}, got {self.network!r}")
 
     def without_images(self) -> NetworkOptions:
         """With the defaults for what has no effect where no images are seen."""

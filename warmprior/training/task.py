@@ -2,43 +2,32 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.data import download_robomimic, generate_demonstrations
-from warmprior.data.opening import Demonstrations
-from warmprior.data.render import renderer_versions
-from warmprior.data.replay import DatasetIndex, DemonstrationReplay
-from warmprior.envs.description import environment_description, robosuite_parts
-from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
-from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
-from warmprior.envs.simulator import task_env_args
-from warmprior.envs.tasks import TASKS
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
+from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.preconditioning import RestingAction
 from warmprior.training.checkpoint import data_digest
-from warmprior.training.options import DataOptions, is_simulated
-from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.transforms.policy import policy_transforms
 
 
 @dataclass(frozen=True)
 class Task:
     """Demonstrations and an environment: what every policy of a comparison is trained for.
 
-    Of your own: :meth:`of` takes raw demonstrations and a function that builds the environment.
+    :meth:`of` takes raw demonstrations and a function that builds the environment, :meth:`from_file` a file.
 
     Attributes:
         name: short name, such as ``"square"``.
@@ -156,6 +145,122 @@ class Task:
             clip=1.0,
         )
 
+    @classmethod
+    def from_file(
+        cls,
+        place: str | Path,
+        make_env: Callable[..., EnvBase] | None = None,
+        *,
+        task: str | None = None,
+        style: str = "ph",
+        observation_steps: int = 2,
+        actions: Literal["delta", "absolute"] = "delta",
+        observation_keys: Sequence[str] | None = None,
+        cameras: Sequence[str] = (),
+        fast_rendering: bool = False,
+        mask: str | None = None,
+        demos: int | None = None,
+        **outcome: Any,
+    ) -> Self:
+        """The demonstrations of a file, and the robosuite environment that recorded them if that is known.
+
+        Args:
+            place: a robomimic HDF5 file, or ``lerobot:`` and the folder or repository of a LeRobotDataset.
+            make_env: see :meth:`of`; instead of the recorded environment.
+
+        Keyword Args:
+            task: of robosuite, for a LeRobotDataset that does not describe its environment.
+            style: of the demonstrations, which decides the time limit.
+            observation_steps: ``To`` of the policies.
+            actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
+            observation_keys: observations to concatenate; the task's by default.
+            cameras: whose images policies see, beside the state of the robot; none by default.
+            fast_rendering: whether the images are without reflections, shadows and smooth edges.
+            mask: a mask of the file, such as ``"train"``.
+            demos: how many to take, from the first on; all by default.
+            **outcome: ``success``, ``measures`` and ``film_rate`` beside a ``make_env``, see :meth:`of`.
+
+        Raises:
+            FileNotFoundError: if there is no such file or dataset.
+            DatasetError: if it is not as it should be, or its images are not what the simulator shows.
+            ValueError: if the file is of another task.
+
+        Examples:
+            >>> from warmprior.training import Task
+            >>> Task.from_file("square.hdf5", mask="train").title  # doctest: +SKIP
+            'square ph'
+        """
+        # Here, since training on a TensorDict needs no reader and no simulator.
+        from warmprior.data.images import renderer_versions
+        from warmprior.data.opening import name_of_place
+        from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
+        from warmprior.training import files
+
+        found = files.opened(place, task, mask)
+        index = found.index(observation_keys=observation_keys)
+        if make_env is not None or not index.env_args:
+            data = found.replay(demos=demos, observation_keys=observation_keys).data
+            return cls.of(name_of_place(place), data, make_env, style=style, **outcome)
+        if demos == len(index.demos):
+            demos = None  # all of them
+        name = files.task_name(index)
+        if task not in (None, name):  # not after hours of training
+            raise ValueError(f"{place} holds demonstrations of {name}, not of {task}: correct the task")
+        if is_mimicgen(index.env_args["env_name"]):
+            find_mimicgen()
+        dataset, images = files.read_steps(
+            found,
+            absolute_actions=actions == "absolute",
+            observation_keys=observation_keys,
+            cameras=cameras,
+            fast_rendering=fast_rendering,
+            demos=demos,
+        )
+        recorded = files.recorded_task(
+            dataset, images, style=style, observation_steps=observation_steps, actions=actions
+        )
+        sha256 = found.digest(files.image_names(cameras), demos)
+        # Nothing is said of what is usual.
+        space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
+        space |= {} if images is None else {"obs": "image", "images": images}
+        facts: dict[str, Any] = {"source": "file", "file": found.name, "sha256": sha256}
+        facts |= {"demonstrations": dataset.num_episodes, "steps": len(dataset.data), **space}
+        # Images are drawn by what is installed.
+        digest = digest_of(sha256, demos, space, images and renderer_versions())
+        return cls(name, style, facts=facts, digest=digest, **recorded)
+
+    def env(
+        self,
+        policy: WarmPriorActor,
+        base: EnvBase | None = None,
+        *,
+        execute: int | None = None,
+        delay: int | None = None,
+        **options: Any,
+    ) -> TransformedEnv:
+        """The environment as a policy is played in it: ``base``, or what ``make_env(**options)`` builds.
+
+        Args:
+            policy: the policy.
+            base: an environment of the task.
+
+        Keyword Args:
+            execute: see :func:`~warmprior.policy_transforms`.
+            delay: likewise.
+            **options: of ``make_env``.
+        """
+        transforms = policy_transforms(
+            policy,
+            normalizer=self.normalizer,
+            **self.adapters,
+            execute=execute,
+            delay=delay,
+            success=self.success,
+            measures=self.measures,
+        )
+        # An environment may have transforms of its own; they stay inside.
+        return TransformedEnv(base or self.make_env(**options), transforms, auto_unwrap=False)
+
     @cached_property
     def identity(self) -> str:
         """Digest of the data, part of the identity of every policy that is trained on them."""
@@ -204,235 +309,3 @@ class Task:
 
 def _no_environment() -> EnvBase:
     raise ValueError("these demonstrations have no environment: give Task.of a function that builds one")
-
-
-def robosuite_task(
-    path: Path | str,
-    style: str = "ph",
-    *,
-    source: str = "file",
-    observation_steps: int = 2,
-    options: DataOptions | None = None,
-) -> Task:
-    """The task of demonstrations in robosuite, played in the simulator that recorded them.
-
-    A LeRobotDataset that does not describe its environment is of that of ``options.task``. The style decides
-    the time limit, and ``source``, ``"scripted"``, ``"official"`` or ``"file"``, says what made the file.
-    """
-    options = DataOptions() if options is None else options
-    # A generated file has as many as were asked for.
-    demos = None if source == "scripted" else options.first(style)
-    found = _open(path, next(iter(options.task), None), options.mask)
-    index = found.index()
-    if demos == len(index.demos):
-        demos = None  # all of them
-    if not index.env_args:
-        raise ValueError(
-            f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
-            "train without an environment (python -m warmprior train --observation-keys), or describe a task "
-            "of your own (docs/benchmarks.md)"
-        )
-    # Not after hours of rendering, or of training.
-    if source == "file" and options.task not in ((), (_name_of(index),)):
-        raise ValueError(
-            f"{path} holds demonstrations of {_name_of(index)}, not of {options.task[0]}: leave --task out "
-            "or correct it"
-        )
-    if is_mimicgen(index.env_args["env_name"]):
-        find_mimicgen()
-    dataset, images = _read(found, options, demos)
-    description = environment_description(dataset.env_args, style, observation_steps, options.actions, images)
-    make_env, adapters = robosuite_parts(description)
-    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
-    # positions, which range far, do not weigh little beside the gripper in the loss.
-    absolute = adapters.get("actions")
-    units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
-    vector = OBSERVATION if images is None else (OBSERVATION, STATE)
-    normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
-    data = normalizer.normalize(dataset.data.exclude("next"))
-    sha256 = found.digest(_names(images), demos)
-    # Nothing is said of what is usual.
-    space: dict[str, Any] = {} if options.actions == "delta" else {"actions": options.actions}
-    space |= {} if images is None else {"obs": "image", "images": images}
-    return Task(
-        _name_of(dataset),
-        style,
-        data,
-        make_env,
-        normalizer,
-        facts={
-            "source": source,
-            "file": found.name,
-            "sha256": sha256,
-            "demonstrations": dataset.num_episodes,
-            "steps": len(dataset.data),
-            **space,
-        },
-        adapters=adapters,
-        rest=None if absolute is None else RestingAction(dataset.pose_columns, normalizer),
-        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
-        clip=1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
-        environment=description,
-        # Images are drawn by what is installed.
-        digest=digest_of(sha256, demos, space, images and renderer_versions()),
-    )
-
-
-def _open(place: Path | str, task: str | None, mask: str | None = None) -> Demonstrations:
-    """The demonstrations at a place; the task's environment is theirs where they do not say."""
-    return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
-
-
-def _names(images: Mapping[str, Any] | None) -> list[str]:
-    """The images' names."""
-    return [] if images is None else [f"{camera}_image" for camera in images["cameras"]]
-
-
-def _read(
-    found: Demonstrations, options: DataOptions, demos: int | None = None
-) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
-    """The demonstrations as policies are to see them, and what images are among it, if any."""
-    if options.obs == "state":
-        absolute = options.actions == "absolute"
-        return found.replay(absolute_actions=absolute, demos=demos), None
-    index = found.index(demos=demos)
-    cameras = options.cameras or (index.task.cameras if index.task else index.cameras)
-    if not cameras:
-        raise ValueError(f"{found.name} has no images, and its task is unknown: name --cameras")
-    names, fast = _names({"cameras": cameras}), options.fast_rendering
-    if set(cameras) <= set(index.cameras):
-        size = found.index(image_keys=names, demos=demos).image_size
-        if size != options.image_size:
-            raise ValueError(
-                f"{index.path} has images of {size} pixels: add --image-size {size} (and a --crop-size "
-                "below), or render it anew"
-            )
-    found = found.with_images(cameras, options.image_size, demos=demos, fast=fast)
-    # What robomimic's image policies see besides: the robot, and not where the objects are.
-    vector = [key for key in index.observation_keys if key != "object"]
-    dataset = found.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
-    return dataset, {
-        "cameras": list(cameras),
-        "size": dataset.image_size,
-        "fast_rendering": fast,
-        "low_dim_keys": vector,
-    }
-
-
-def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
-    """Short name of a dataset's task, or the environment's where it is none of ours."""
-    task = dataset.task
-    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
-
-
-def read_like(
-    place: Path | str, name: str, facts: Mapping[str, Any], mask: str | None = None
-) -> tuple[TensorDictBase, str]:
-    """Further demonstrations of a task in robosuite, in raw units, as policies of these facts see them.
-
-    Also what the place is called in results. A ``ValueError`` if they are of another task.
-    """
-    found = _open(place, name, mask)
-    if (theirs := _name_of(found.index())) != name:  # before images are rendered
-        raise ValueError(f"{place} holds demonstrations of {theirs}, but these policies are for {name}")
-    images = facts.get("images")
-    demos = min(facts["demonstrations"], len(found.index().demos))
-    called = found.name
-    if found.digest(_names(images), demos) == facts["sha256"]:
-        called = "the TRAINING demonstrations (not held out)"
-    seen: dict[str, Any] = {}
-    if images is not None:
-        seen = {
-            "obs": "image",
-            "cameras": tuple(images["cameras"]),
-            "image_size": images["size"],
-            "fast_rendering": images["fast_rendering"],
-        }
-    dataset, _ = _read(found, DataOptions(actions=facts.get("actions", "delta"), **seen))
-    return dataset.data.exclude("next"), called
-
-
-def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
-    """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
-
-    In the style ``"position"`` policies see the position alone, as in the paper.
-
-    Examples:
-        >>> from warmprior.training import navigation_task
-        >>> task = navigation_task()
-        >>> task.title, task.make_env(batch_size=[8]).batch_size
-        ('navigation toy', torch.Size([8]))
-    """
-    if style not in ("toy", "position"):
-        raise ValueError(f"the style of the toy is 'toy' or 'position', got {style!r}")
-    octaves = 0 if style == "position" else OCTAVES
-    make_env = partial(NavigationEnv, octaves=octaves)
-    return Task("navigation", style, navigation_demonstrations(octaves), make_env)
-
-
-def load_task(options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2) -> Task:
-    """Read, download or generate the demonstrations of one task.
-
-    Args:
-        options: where they come from, and what policies are to see of them.
-        name: of a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
-            which may take the options; ``None`` for that of ``options.dataset``.
-        style: of the demonstrations.
-        observation_steps: ``To`` of the policies.
-
-    Raises:
-        ValueError: if there is no such task, or a file is of another one.
-
-    Examples:
-        >>> from warmprior.training import DataOptions, load_task
-        >>> load_task(DataOptions(), "navigation").title
-        'navigation toy'
-    """
-    if name == "navigation":
-        return navigation_task("position" if style == "position" else "toy")
-    if name is not None and ":" in name:
-        module, _, function = name.partition(":")
-        try:
-            make = getattr(importlib.import_module(module), function)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"--task {name}: {error}") from error
-        task = make(options) if inspect.signature(make).parameters else make()
-        if not isinstance(task, Task):
-            raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
-        return task
-    path, source = demonstrations_of(options, name, style)
-    return robosuite_task(path, style, source=source, observation_steps=observation_steps, options=options)
-
-
-def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
-    """The file or dataset of a robosuite task, downloaded or generated if needed, and what made it."""
-    if options.dataset is not None:
-        return options.dataset, "file"
-    if options.download:
-        return download_robomimic(str(name), style, force=options.force_download), "official"
-    return generate_demonstrations(str(name), style, options.count(style)), "scripted"
-
-
-def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
-    """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style."""
-    options.check()
-    names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
-    if options.generated and any(name in TASKS for name in names):
-        counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
-        print(
-            f"Data: {counts} scripted demonstrations per task. They stand in for the official human data "
-            "(--download); success rates on them are not comparable with the paper's.",
-            flush=True,
-        )
-    found: dict[tuple[str | None, str], None] = {}
-    for name in names:
-        one_style = name is not None and not is_simulated(name)
-        styles = options.data[: 1 if one_style else None]
-        if options.download and name in TASKS:
-            there = tuple(style for style in styles if style in TASKS[name].official)
-            if there and there != styles:
-                left_out = ", ".join(style for style in styles if style not in there)
-                print(f"Data: there are no official {left_out} demonstrations of {name}.", flush=True)
-                styles = there
-        found |= dict.fromkeys((name, style) for style in styles)
-    return list(found)

@@ -1,0 +1,148 @@
+"""Train, measure and play what a comparison of sources asks for, as jobs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from typing import Any
+
+import pandas as pd
+
+from lab.files import PartialFailure, read_lines
+from lab.jobs import Jobs
+from lab.measures import measure
+from lab.methods import Method
+from lab.options import Evaluation, Options
+from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.distributed import go_on_alone, rank, world_size
+from warmprior.io.files import check_writable, write_atomic
+from warmprior.training import Episode
+
+EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
+
+
+def compare(
+    options: Options,
+    policies: Sequence[Policy],
+    conditions: Callable[[Method], Sequence[Cell]] = lambda method: [Cell(0, 0)],
+) -> tuple[pd.DataFrame, list[str]]:
+    """Train, measure and play what is missing; the rows so far, and what failed.
+
+    Rows do not depend on who computes them, nor in which order. `conditions` lists how else policies are
+    played: a row for each.
+    """
+    evaluation, places = options.evaluation, {p.name: i for i, p in enumerate(policies)}
+
+    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        delays = row.get("delay") or 0, row.get("guidance") or ""
+        return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
+
+    def add(row: dict[str, Any]) -> None:
+        rows.append(row)
+        rows.sort(key=order)
+        write_rows(path, rows)
+
+    path = options.run.out / "results.jsonl"
+    rows = read_lines(path) if path.exists() else []
+    if others := {row["policy"] for row in rows} - places.keys():
+        raise ValueError(
+            f"{path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
+            "with those, or choose another --out"
+        )
+    failures = begin(options, policies)
+    with Jobs(options.run) as jobs:
+        for policy in sorted(policies, key=lambda policy: policy.training.seed):
+            cells = [
+                replace(condition, checkpoint=checkpoint, nfe=nfe)
+                for checkpoint, nfe, condition in product(
+                    policy.training.checkpoint_iterations,
+                    policy.method.nfes(evaluation.nfe),
+                    conditions(policy.method),
+                )
+            ]
+            facts = {cell: (policy.facts | cell.facts()).items() for cell in cells}
+            missing = [cell for cell in cells if not any(facts[cell] <= row.items() for row in rows)]
+            if str(policy) not in failures:
+                submit(jobs, policy, missing, evaluation, add)
+        failures |= jobs.wait()
+    reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
+    if not rows:
+        raise PartialFailure("; ".join(reasons))
+    return pd.DataFrame(rows), reasons
+
+
+def train_all(options: Options, policies: Sequence[Policy]) -> None:
+    """Train what is missing, and play nothing."""
+    failures = begin(options, policies)
+    with Jobs(options.run) as jobs:
+        for policy in policies:
+            jobs.submit(str(policy), train, policy, training=True, status=policy.status)
+        if failures := failures or jobs.wait():
+            raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
+
+
+def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
+    """Write `tasks.json`, and under torchrun train each policy in all processes together; what failed.
+
+    The first process goes on alone.
+    """
+    check_writable(options.run.policies)
+    tasks = {policy.place: policy.task() for policy in policies}.values()
+    text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
+    if not rank():
+        write_atomic(options.run.out / "tasks.json", lambda path: path.write_text(text))
+
+    failures = {}
+    for policy in policies if world_size() > 1 else ():
+        try:
+            train(policy)
+        except (FloatingPointError, ValueError) as error:  # in all processes alike
+            failures[str(policy)] = str(error)
+            print(f"FAILED {policy}: {error}", flush=True)
+    go_on_alone()
+    return failures
+
+
+def submit(
+    jobs: Jobs,
+    policy: Policy,
+    cells: Sequence[Cell],
+    evaluation: Evaluation,
+    add: Callable[[dict[str, Any]], None],
+) -> None:
+    """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
+    last, was_there = policy.training.iterations, policy.is_trained
+    episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
+    measures: dict[int, dict[str, Any]] = {}  # by NFE, of the last checkpoint; others are only played
+
+    def trained(nothing: None) -> None:
+        jobs.say(f"{'found' if was_there else 'trained'} {policy}, {last} iterations")
+
+    def measured(found: dict[int, dict[str, Any]]) -> None:
+        measures.update(found)
+        for cell in [cell for cell in cells if cell.checkpoint == last]:
+            played(cell, [])
+
+    def played(cell: Cell, found: list[Episode]) -> None:
+        mine = episodes[cell]
+        mine += found
+        at_end = cell.checkpoint == last
+        if len(mine) == evaluation.episodes and (measures or not at_end):
+            made = row(policy, cell, mine, measures.get(cell.nfe, {}) if at_end else {})
+            add(made)
+            jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
+
+    group = str(policy)
+    training = {"training": True, "status": policy.status, "then": trained, "group": group}
+    first = jobs.submit(f"train {policy}", train, policy, **training)
+    after = {"after": first, "group": group}
+    if any(cell.checkpoint == last for cell in cells):
+        jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
+    for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
+        more, few = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
+        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, few, **more)

@@ -1,0 +1,40 @@
+"""Files of results, the cache of what is generated, and what may go wrong in part."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from warmprior.io import script
+from warmprior.io.files import check_regular
+
+
+class PartialFailure(RuntimeError):
+    """Some of the work failed; the rest of it is done and written down."""
+
+
+ERRORS = (*script.ERRORS, PartialFailure)
+"""What a user can mend: reported without a traceback."""
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read a file of JSON objects, one per line; a ``ValueError`` that names the line that is damaged."""
+    check_regular(path)
+    records = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            records.append(json.loads(line))
+            if not isinstance(records[-1], dict):
+                raise ValueError("it is no JSON object")
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"{path}, line {number} is damaged ({error}): remove that line, and continue with --resume"
+            ) from error
+    return records
+
+
+def cache_folder() -> Path:
+    """Where generated files are kept: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
+    return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

@@ -1,0 +1,49 @@
+"""What this machine is, and whether a device works here."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+
+from warmprior.io.distributed import launched
+
+PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy", "lerobot")
+
+
+def facts_of_machine(**more: Any) -> dict[str, Any]:
+    """Versions and hardware, as files of results keep them."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue  # an extra that this run does without
+    hardware = {"machine": platform.machine(), "cores": os.cpu_count(), **more}
+    if torch.cuda.is_available():
+        hardware["gpu"] = torch.cuda.get_device_name()
+    return {"versions": versions, "hardware": hardware}
+
+
+def check_device(device: str) -> None:
+    """Refuse a device, such as ``"cuda"`` for one each, that not every process here has, or that fails."""
+    try:
+        if torch.device(device).type == "cuda" and launched():
+            local, devices = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
+            if torch.device(device).index is not None:
+                raise ValueError(
+                    f"--device {device}: under torchrun every process takes a GPU of its own: --device cuda"
+                )
+            if local > devices:
+                raise ValueError(
+                    f"--device {device}: {local} processes on a machine with {devices} CUDA device(s): start "
+                    f"torchrun with --nproc-per-node {devices}"
+                )
+        # Computed and read: there are devices that can only be named, such as meta.
+        torch.ones(1, device=device).add(1).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"--device {device} does not work here: {reason}") from error

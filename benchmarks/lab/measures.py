@@ -1,0 +1,217 @@
+"""What is measured of policies beside their success: leak, memory, and the shape of their flow."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from tqdm import tqdm
+
+from lab.methods import Method
+from lab.options import MeasuredOptions
+from lab.policies import Policy
+from lab.scripted.generate import generate_demonstrations
+from lab.tasks import demonstrations_of, read_like
+from warmprior import Prior, WarmPriorActor
+from warmprior.diagnostics import (
+    SharedObservations,
+    bootstrap_ratio,
+    branching_bound,
+    curvature,
+    encoded_windows,
+    mean_error,
+    memory_gain,
+    source_coverage,
+    source_leak,
+)
+from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
+
+MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
+HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
+
+# Ratios to the baseline: the entry of `curvature` that each compares.
+RATIOS = {
+    "ratio": "kappa",
+    "ratio_executed": "kappa_executed",
+    "ratio_relative": "relative_executed",
+    "ratio_one_step": "one_step_error_executed",
+}
+
+
+def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float | None]]:
+    """Measure a policy on its training data, by NFE: on the same observations and draws for all."""
+    policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
+    nfes, observation_steps = method.nfes(asked), trained.network.observation_steps
+    shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
+    drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+    shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
+    windows = shared.windows(policy.prior, see_history=sees_history(policy))
+    seen = encoded_windows(policy, windows)
+    leaks: Mapping[int, Any] = {}
+    if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
+        leaks = source_leak(policy, seen, nfes=nfes, episodes=shared.episodes)
+    generator = torch.Generator().manual_seed(0)
+    met = shared.met(policy, generator=generator)
+    allowed = allowed_nfes(policy, nfes)
+    means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
+    gains = memory_gain(policy, windows if sees_history(policy) else seen, nfes=nfes)
+    # How straight the flow is between source and targets, over the executed H.
+    kappa, relative = math.nan, math.nan
+    if policy.ode.max_nfe is None:
+        with warnings.catch_warnings():  # the NaN says that something does not move
+            warnings.simplefilter("ignore")
+            values = curvature(policy, met, 100, generator=generator)
+        kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
+    flow = {
+        "kappa": kappa,
+        "relative_curvature": relative,
+        "bound": float(bounds(policy.prior, met, method.parts.coupling is not None)[1]),
+        "coverage": source_coverage(policy, met),
+    }
+    return {
+        nfe: {
+            "mean_error": means[nfe].target,
+            "mean_revision_data": means[nfe].revision,
+            "source_leak": leaks[nfe].leak if nfe in leaks else None,
+            "inner_step_ratio": leaks[nfe].inner_step_ratio if nfe in leaks else None,
+            "memory_gain": gains[nfe],
+            **flow,
+        }
+        for nfe in allowed
+    }
+
+
+def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
+    """Bound of the branching cost, whole and executed; NaN where it does not apply."""
+    if not coupled:
+        try:
+            bound = branching_bound(batch, prior)
+            return torch.stack([bound[key].nanmean().cpu() for key in ("total", "total_executed")])
+        except ValueError:  # a source that is not Gaussian
+            pass
+    return torch.full((2,), math.nan)
+
+
+def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
+    """Observations that no policy of a task was trained on, and what they are in words.
+
+    A task of one's own has none: its training data.
+    """
+    place: Path | str
+    task, chunk_length = policy.task(), policy.method.chunk_length
+    facts, device, count = task.facts, options.run.device, options.observations
+    given, mask = options.validation, None
+    generator = torch.Generator().manual_seed(0)
+    shape = {"observation_steps": policy.network.observation_steps}
+    if task.normalizer is None or "file" not in facts:
+        if given is not None:
+            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
+        shared = SharedObservations(task.data.to(device), chunk_length, **shape)
+        if len(shared) > count:
+            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
+        return shared, "the TRAINING demonstrations (not held out)"
+    if given is not None:
+        place, words = given, ""
+    elif policy.data.mask == "train":
+        place, words, mask = demonstrations_of(policy.data, task.name, task.style)[0], "", "valid"
+    elif facts.get("source") != "scripted":
+        raise ValueError(
+            f"these policies are trained on {facts['file']}: train them with --mask train, to measure "
+            "on the part of the file that is called valid, or add --validation FILE with others (or with the "
+            "same file, to measure on the training data)"
+        )
+    else:
+        # As many as the training demonstrations suggest, with room to spare.
+        usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
+        episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
+        place = generate_demonstrations(task.name, task.style, episodes, HELD_OUT_SEED)
+        words = f"{episodes} newly generated demonstrations"
+    data, called = read_like(place, task.name, facts, mask)
+    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
+    data = copy.deepcopy(task.normalizer).to("cpu").normalize(data).to(device)
+    return SharedObservations(data, chunk_length, **shape, count=count, generator=generator), words or called
+
+
+def straightness(
+    policies: Mapping[Method, Mapping[int, WarmPriorActor]],
+    observations: SharedObservations,
+    *,
+    n_steps: int = 100,
+    draws: int = 1,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """Curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
+
+    Every policy is measured at the history of its training and, if it depends on that, at the one that
+    deployment meets, made from its own prediction one decision earlier. A row per policy, training seed and
+    mean, and one with `seed` None for the average over several seeds.
+    """
+    policies = {method: actors for method, actors in policies.items() if method.is_flow}
+    if not policies:
+        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+    seeds = sorted(next(iter(policies.values())))
+    # By method and mean, of each seed: curvatures, and bounds of the branching cost.
+    measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}
+    jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
+    for method, actor in tqdm(jobs, desc="curvature", disable=None):
+        device = next(actor.parameters()).device
+        # Of the earlier prediction: at deployment its noise and that of the next are independent.
+        earlier = torch.Generator(device).manual_seed(seed + 1)
+        windows = observations.windows(actor.prior, see_history=sees_history(actor))
+        batches = {"training": encoded_windows(actor, windows)}
+        if depends_on_history(actor, batches["training"]):
+            batches["deployed"] = observations.deployed(actor, generator=earlier)
+        for mean, batch in batches.items():
+            # The same source noise for every policy and mean.
+            generator = torch.Generator(device).manual_seed(seed)
+            try:
+                values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+            except FloatingPointError as error:
+                raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
+            limits = bounds(actor.prior, batch, method.parts.coupling is not None)
+            measured.setdefault((method, mean), []).append((values, limits))
+    first = [values for values, _ in measured[next(iter(policies)), "training"]]
+    rows = []
+    for (method, mean), found in measured.items():
+        parts = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
+        if len(seeds) > 1:
+            values, limits = zip(*found, strict=True)
+            # NaN where any predicts no motion: the others alone would be no average over the seeds.
+            averages = (torch.stack(one).mean(0) for one in (values, limits, first))
+            parts.append((None, *averages))
+        for s, values, limits, baseline in parts:
+            rows.append(
+                {
+                    "policy": str(method),
+                    **method.facts,
+                    "mean": mean,
+                    "seed": s,
+                    "observations": len(observations),
+                    **{key: float(value.nanmean()) for key, value in values.items()},
+                    **dict(zip(("bound", "bound_executed"), limits.tolist(), strict=True)),
+                    **ratios(values, baseline, observations.episodes, seed),
+                }
+            )
+    return rows
+
+
+def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int) -> dict[str, float]:
+    """The ratios to the baseline, with their 95% intervals."""
+    found: dict[str, float] = {}
+    # A field that predicts no motion has no error of one step either, and no merit in that.
+    still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
+    for name, key in RATIOS.items():
+        generator = torch.Generator().manual_seed(seed)
+        counted = values[key]
+        if name == "ratio_one_step":
+            counted = counted.masked_fill(still, math.nan)
+        ends = bootstrap_ratio(counted, baseline[key], episodes, generator=generator)
+        found |= zip((name, f"{name}_low", f"{name}_high"), ends, strict=True)
+    return found

@@ -1,0 +1,406 @@
+"""What the benchmarks share: policies, and the jobs that train, measure and play them.
+
+A policy lies in a folder named by a digest of everything that determines it, so runs with the same options
+share it. What is measured of it is a row: one JSON object in `results.jsonl`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from filelock import FileLock
+from torchrl.envs import EnvBase
+from torchrl.record.loggers import get_logger
+
+from lab.learned_sources import Learner, learn
+from lab.methods import Method
+from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
+from lab.report import read_rows
+from lab.tasks import DataOptions, load_task, task_places
+from warmprior import WarmPriorActor
+from warmprior.diagnostics import mean_revision, smoothness
+from warmprior.io.distributed import from_leader, leader_first, rank
+from warmprior.io.files import digest_of, read_json, write_atomic
+from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.training import (
+    Episode,
+    NetworkOptions,
+    Task,
+    TrainingConfig,
+    load_policy,
+    play_episode,
+    train_policy,
+)
+from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
+from warmprior.training.checkpoint import load_state, module_tensors, restore_module, restoring, save_state
+
+LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy of a comparison, trained or not. A worker process builds all of it from these options."""
+
+    place: tuple[str | None, str]  # of the task: what `load_task` takes
+    data: DataOptions
+    network: NetworkOptions
+    method: Method
+    training: TrainingConfig  # with its seed
+    run: Run  # with an absolute folder
+    grid: str
+    name: str = ""  # of its own folder
+    facts: dict[str, Any] = field(default_factory=dict, compare=False)  # what every row of it says
+
+    @property
+    def folder(self) -> Path:
+        return self.run.policies / self.name
+
+    def __str__(self) -> str:
+        return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether its last policy of averaged weights is there; the file is whole, or not there."""
+        return (policy_path(self.folder, self.training.iterations) / "model.safetensors").is_file()
+
+    @property
+    def status(self) -> Path:
+        """How far its training is, and the processor time that it took."""
+        return self.folder / "status.json"
+
+    def task(self) -> Task:
+        """What it is trained for; read once per process."""
+        return cached_task(self.data, *self.place, self.network.observation_steps)
+
+    def teacher(self) -> Policy | None:
+        method = self.method.teacher
+        return None if method is None else policy_of(self.task(), self, method)
+
+    def load(self, checkpoint: int | None = None) -> WarmPriorActor:
+        """The policy of averaged weights, on the CPU, as it is played here."""
+        path = policy_path(self.folder, checkpoint or self.training.iterations)
+        return load_policy(path).replace(grid=self.grid)
+
+    @property
+    def losses(self) -> list[tuple[int, float]]:
+        return load_state(self.folder / "state.safetensors")[1]["losses"]
+
+    @property
+    def seconds(self) -> float | None:
+        """Processor time of its training, with its teacher's; None if it is not trained."""
+        teacher, own = self.teacher(), clock(self.status)
+        others = 0.0 if teacher is None else teacher.seconds
+        return None if own is None or others is None else own + others
+
+
+cached_task = cache(load_task)
+
+
+def facts_of(task: Task) -> dict[str, Any]:
+    """A task's name and style, and what its demonstrations are."""
+    return {"task": task.name, "data": task.style, **task.facts}
+
+
+def policies_of(options: Options, *more: tuple[str, str], only: bool = False) -> list[Policy]:
+    """One policy per task, recipe, method and seed, the baseline's first; demonstrations are read, or made.
+
+    The tasks are those that the options name and `more`, or with `only` the latter alone.
+    """
+    run = replace(options.run, out=options.run.out.absolute())
+    with leader_first():  # other processes find what it has generated, rendered or downloaded
+        places = [*([] if only else task_places(options.data)), *more]
+        steps = options.network.observation_steps
+        tasks = {place: cached_task(options.data, *place, steps) for place in places}
+        names = [(task.name, task.style) for task in tasks.values()]
+        if twice := [" ".join(name) for name in set(names) if names.count(name) > 1]:
+            raise ValueError(
+                f"--task: two tasks are called {twice[0]}; give one of them another name or style"
+            )
+    found = []
+    for place, task in tasks.items():
+        if place[0] is not None and ":" in place[0]:
+            check_environment(task)
+        network = options.network if task.images else options.network.without_images()
+        for training in options.trainings():
+            for method in options.sources.methods():
+                if method.chunk_length > task.longest:
+                    raise ValueError(
+                        f"{method} predicts more steps than the longest demonstration of {task.title} has, "
+                        f"{task.longest}: choose a shorter --chunk"
+                    )
+                for seed in options.seeds:
+                    seeded, grid = replace(training, seed=seed), options.evaluation.grid
+                    like = Policy(place, options.data, network, method, seeded, run, grid)
+                    found.append(policy_of(task, like, method))
+    return list({policy.folder: policy for policy in found}.values())
+
+
+def check_environment(task: Task) -> None:
+    """Compare the environment of a task of one's own with its demonstrations, before any training."""
+    env = task.make_env()
+    known = list(env.observation_spec.keys(True, True))
+    for key in (task.success, *task.measures):
+        if key not in known:
+            raise KeyError(
+                f"the environment of {task.name} does not write {key!r} beside its reward: it writes {known}"
+            )
+    for key, spec in (("observation", env.observation_spec), ("action", env.full_action_spec)):
+        theirs = tuple(spec[key].shape) if key in spec.keys(True, True) else None
+        if theirs != (task.data[key].shape[-1],):
+            raise ValueError(
+                f"{key!r} of the environment of {task.name} has shape {theirs}, and that of its "
+                f"demonstrations {(task.data[key].shape[-1],)}"
+            )
+    env.close()
+
+
+def policy_of(task: Task, like: Policy, method: Method) -> Policy:
+    """The policy of another method on a task, with the options of a policy; names its folder."""
+    digest = digest_of(
+        task.identity,
+        asdict(like.training),
+        method.config(),
+        asdict(like.network),
+        like.run.device,
+        like.run.compile,
+        version("torch"),
+        version("warmprior"),
+        STATE_FORMAT,
+    )
+    source = slug(",".join(filter(None, (method.name, method.options))))
+    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest[:10]}"
+    facts = {
+        "task": task.name,
+        "data": task.style,
+        **task.space,
+        **method.facts,
+        "seed": like.training.seed,
+        "iterations": like.training.iterations,
+    }
+    return replace(like, method=method, name=name, facts={**facts, "policy": name})
+
+
+def slug(text: str) -> str:
+    """A text as part of a folder's name; no two texts have the same."""
+    plain = re.sub(r"[^\w.=+,-]+", "-", text, flags=re.ASCII)[:60]
+    return plain if plain == text else f"{plain}-{digest_of(text)[:8]}"
+
+
+def train(policy: Policy) -> None:
+    """Train a policy, or find it trained. Whoever else asks for it waits.
+
+    What it needs before, a teacher or a source that learns, is trained here as well.
+    """
+    policy.folder.mkdir(parents=True, exist_ok=True)
+    if (teacher := policy.teacher()) is not None:
+        train(teacher)
+    with FileLock(policy.folder / ".lock") if not rank() else nullcontext():
+        if from_leader(lambda: policy.is_trained):
+            return
+        task, method = policy.task(), policy.method
+        # A worker that trains on a GPU sees no other.
+        device = torch.device(policy.run.device).type
+        training = method.recipe(policy.training)
+        widths = (
+            task.data["action"].shape[-1],
+            0 if task.images else task.vector.shape[-1],
+            policy.network.observation_steps,
+        )
+        prior, start = method.prior(widths), method.start(widths)
+        progress = status_writer(policy.status, training.iterations)
+        for part in (prior, start):
+            if isinstance(part, Learner):
+                with leader_first():
+                    learned(part, policy, training)
+        logger, logs = None, str(policy.run.out / "logs")
+        if policy.run.logger != "none" and not rank():
+            logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
+        # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
+        train_policy(
+            task,
+            prior,
+            policy.folder,
+            network=policy.network,
+            training=training,
+            start=start,
+            coupling=method.coupling(teacher.load().to(device) if teacher else None),
+            see_history=method.parts.sees_history,
+            max_nfe=None if method.is_flow else 1,
+            device=device,
+            compile=policy.run.compile,
+            logger=logger,
+            description=None,
+            progress=progress,
+        )
+        progress(training.iterations)  # the last policy is saved as well
+    if torch.cuda.is_initialized():
+        torch.cuda.empty_cache()  # for the next training, which may be another worker's
+
+
+def clock(status: Path) -> float | None:
+    """The processor time in a status file, if there is one."""
+    if not status.exists():
+        return None
+    try:
+        return float(read_json(status)["seconds"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{status} is damaged: remove it, and the time before is not counted ({error})"
+        ) from error
+
+
+def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
+    """Write how far a training is, once a second, and the processor time, of earlier starts as well."""
+    began = time.process_time() - (clock(path) or 0.0)
+    wrote = time.monotonic()
+
+    def write(iteration: int) -> None:
+        nonlocal wrote
+        if rank() or (time.monotonic() - wrote < 1.0 and iteration < iterations):
+            return
+        wrote = time.monotonic()
+        seconds = time.process_time() - began
+        status = {"iteration": iteration, "iterations": iterations, "seconds": seconds}
+        write_atomic(path, lambda path: path.write_text(json.dumps(status)))
+
+    return write
+
+
+def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
+    """Let a source learn, or take what it learnt when the training was begun."""
+    path = policy.folder / "learner.safetensors"
+    if path.exists():
+        with restoring(path):
+            restore_module(learner, load_state(path)[0])
+        return
+    learn(
+        learner,
+        policy.task().data,
+        iterations=max(1, round(LEARNING_SHARE * training.iterations)),
+        observation_steps=policy.network.observation_steps,
+        withhold=training.cold_probability,
+        seed=training.seed,
+    )
+    save_state(path, module_tensors(learner), policy.method.config())
+
+
+def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
+    """The last policies by method and seed; a method of which a seed failed would not compare."""
+    seeds = {policy.training.seed for policy in policies}
+    found: dict[Method, dict[int, WarmPriorActor]] = {}
+    for policy in policies:
+        if policy.is_trained:
+            found.setdefault(policy.method, {})[policy.training.seed] = policy.load().to(device)
+    return {method: actors for method, actors in found.items() if actors.keys() == seeds}
+
+
+def finished_policies(run: Path, options: Options) -> list[Policy]:
+    """The policies of a finished run by the methods that are asked for; its data are read again."""
+    stored = of_run(options, run)
+    policies = policies_of(with_parts(stored, evaluation={"grid": options.evaluation.grid}))
+    methods = " ".join(stored_options(Options, run, None).sources.prior)
+    for policy in policies:
+        if not policy.is_trained:
+            raise FileNotFoundError(
+                f"--run {run} has no trained policy {policy} of these versions and data (options.json has "
+                f"its own): finish it with --resume --out {run}, or name its methods: --prior {methods}"
+            )
+    return policies
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How a policy is played: the episodes of a cell make one row."""
+
+    checkpoint: int  # of the policy's training, an iteration
+    nfe: int  # network evaluations per chunk
+    delay: int | None = None  # control steps until chunks take effect; None: the simulator waits
+    execute: int | None = None  # actions per decision; all H by default
+    guidance: RealTimeChunking | None = None
+
+    def facts(self) -> dict[str, Any]:
+        found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
+        if self.delay is not None:
+            guidance = "none" if self.guidance is None else "rtc"
+            found |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}
+        return found
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self.facts().items())
+
+
+def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
+    """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
+    actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
+    task, noise = policy.task(), {"nfe": cell.nfe, "policy_seed": policy.training.seed}
+    outcome = {"success": task.success, "measures": task.measures}
+    return [play_episode(actor, env, episode, **noise, **outcome) for episode in seeds]
+
+
+@lru_cache(maxsize=1)
+def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
+    """A policy and its environment: an episode after one of the same policy needs no preparation."""
+    key = (policy.data, *policy.place, policy.network.observation_steps)
+    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
+    base = simulator(key, play_on)
+    return actor, policy.task().env(actor, base, execute=cell.execute, delay=cell.delay)
+
+
+@lru_cache(maxsize=1)
+def simulator(task: tuple[Any, ...], play_on: bool) -> EnvBase:
+    """The environment of a task; building a simulator takes a second, so it serves all policies."""
+    return cached_task(*task).make_env(**({"terminate_on_success": False} if play_on else {}))
+
+
+def row(
+    policy: Policy, cell: Cell, episodes: Iterable[Episode], measures: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The row of a cell: what the policy is, how it was played, and what came out."""
+    # Sums depend on the order: that of the seeds, not that in which the episodes ended.
+    episodes = sorted(episodes, key=lambda episode: episode.seed)
+    decisions = torch.cat([episode.decisions for episode in episodes])
+    # Episodes of a single decision have no boundary between chunks.
+    several = any(len(episode.decisions) > 1 for episode in episodes)
+    smooth = smoothness(decisions) if several else None
+    solved = [episode.success for episode in episodes]
+    own = {name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures}
+    return {
+        **policy.facts,
+        **cell.facts(),
+        "episodes": len(solved),
+        "successes": sum(solved),
+        "success_rate": sum(solved) / len(solved),
+        "mean_steps": sum(episode.steps for episode in episodes) / len(solved),
+        "boundary_jump": None if smooth is None else smooth.boundary_jump,
+        "inner_jump": None if smooth is None else smooth.inner_jump,
+        "mean_revision": mean_revision(decisions),
+        # A measure of an episode may be called what a column is called.
+        **{f"episode_{name}": sum(values) / len(values) for name, values in own.items()},
+        **measures,
+        "training_seconds": policy.seconds,
+        "outcomes": "".join("01"[solved] for solved in solved),
+    }
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write a file of rows in the place of another, and read it again as a table."""
+    # JSON has no NaN: what is not known is null.
+    known = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        for row in rows
+    ]
+    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in known)
+    write_atomic(path, lambda path: path.write_text(text))
+    return read_rows(path)

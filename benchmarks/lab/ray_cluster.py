@@ -1,0 +1,176 @@
+"""A Ray cluster whose machines can do this library's work."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import re
+import socket
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lab.workers import available_cores
+from warmprior.io.extras import require
+from warmprior.io.files import write_atomic
+from warmprior.io.workers import WorkerError, stop_forking
+
+PATIENCE = 60.0
+"""Seconds in which a cluster has to answer; each machine has three times as long to import this library."""
+
+CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
+"""What a process does to find out whether there is a cluster."""
+
+
+def check_ray(address: str | None = None) -> str | None:
+    """Refuse a cluster that cannot be reached: ``HOST:PORT`` of its head, or ``auto``; or ``$RAY_ADDRESS``.
+
+    Returns the address, or ``None`` for a cluster of this machine alone, which has yet to be started.
+    """
+    require("ray", "ray")
+    option = "--ray-address" if address else "RAY_ADDRESS"
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
+    if address == "local":
+        return None
+    host, _, port = address.rpartition(":")
+    if address != "auto" and not (host and port.isdecimal() and "/" not in host):
+        raise ValueError(
+            f"{option} {address} is not the address of a cluster's head, HOST:PORT (6379 by default); "
+            "start from one of its machines, not through ray://"
+        )
+    try:
+        if address != "auto":  # fails at once where nobody listens
+            socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+        # In a process of its own: Ray itself goes on trying for minutes, and cannot be interrupted.
+        command = [sys.executable, "-c", CONNECT, address]
+        done = subprocess.run(command, stderr=subprocess.PIPE, timeout=PATIENCE, check=False)
+        if done.returncode == 0:
+            return address
+        reason = reason_of(done.stderr)
+    except subprocess.TimeoutExpired as late:
+        reason = f"it does not answer within {PATIENCE:g} seconds. {reason_of(late.stderr or b'')}"
+    except (OSError, OverflowError) as error:
+        reason = str(error)
+    raise ConnectionError(
+        f"{option} {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
+        "--head (RAY_AUTH_MODE=token if it asks for a token), or leave out --ray-address and RAY_ADDRESS for "
+        "this machine alone"
+    )
+
+
+def reason_of(text: bytes) -> str:
+    """The message at the end of what a Python process, or Ray, wrote before it ended."""
+    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", text.decode(), flags=re.M)[-1].strip()
+
+
+def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
+    """Refuse a machine with other versions: it might compute something else.
+
+    Examples:
+        >>> from lab.ray_cluster import check_versions
+        >>> check_versions({"torch": "2.11.0"}, {"torch": "2.10.0"}, "node-7")
+        Traceback (most recent call last):
+            ...
+        warmprior.io.workers.WorkerError: node-7 has torch 2.10.0, and this process 2.11.0: ...
+    """
+    for name, here in mine.items():
+        there = theirs.get(name, "none")
+        if there != here:
+            raise WorkerError(
+                f"{node} has {name} {there}, and this process {here}: install the same everywhere"
+            )
+
+
+def versions() -> dict[str, str]:
+    """Of what has to be the same on all machines."""
+    packages = ("warmprior", "torch", "torchrl", "tensordict")
+    return {"Python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _look(tokens: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """On a machine: its versions, and the files of ``tokens`` that it does not see as they were written."""
+
+    def seen(path: str) -> str | None:
+        try:
+            return Path(path).read_text()
+        except OSError:
+            return None
+
+    return versions(), [path for path, token in tokens.items() if seen(path) != token]
+
+
+@contextlib.contextmanager
+def ray_cluster(
+    address: str | None = None, num_cpus: int | None = None, folders: Sequence[Path] = ()
+) -> Iterator[Any]:
+    """A connection to a Ray cluster whose machines can do this library's work; yields the module ``ray``.
+
+    One that this process has already is taken, and left as it is. Without an address (see :func:`check_ray`)
+    one of this machine is started, and ended. All machines have to share the ``folders``. A ``WorkerError``
+    if one has other versions or cannot start the library, an ``OSError`` if it does not see a folder.
+    """
+    ray = require("ray", "ray")
+    with contextlib.ExitStack() as stack:
+        if not ray.is_initialized():
+            address = check_ray(address)
+            # Workers look for modules where this process does.
+            path = os.pathsep.join(map(os.path.abspath, sys.path))
+            options: dict[str, Any] = {
+                "address": address or "local",
+                "runtime_env": {"env_vars": {"PYTHONPATH": path}},
+            }
+            if address is None:  # nobody else is to reach it
+                cores = num_cpus or available_cores()
+                options |= {"num_cpus": cores, "include_dashboard": False}
+                options["_node_ip_address"] = "127.0.0.1"
+            stop_forking()  # a connection does not survive it
+            stack.callback(ray.shutdown)
+            ray.init(**options, logging_level="ERROR")
+        with _tokens(folders) as tokens:
+            nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
+            looks = [_look_at(ray, node, tokens) for node in nodes]  # all at once: each takes seconds
+            for node, look in zip(nodes, looks, strict=True):
+                _check_node(ray, node, look)
+        yield ray
+
+
+def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> Any:
+    """A task that tells what a machine has and sees."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+    return ray.remote(_look).options(num_cpus=0, scheduling_strategy=there).remote(tokens)
+
+
+def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
+    name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
+    try:
+        theirs, unseen = ray.get(look, timeout=3 * PATIENCE)
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None) or error
+        raise WorkerError(f"{name} cannot start this library: {cause}") from error
+    check_versions(versions(), theirs, name)
+    if unseen:
+        raise OSError(
+            f"{name} does not see what is written to {Path(unseen[0]).parent} here: choose an --out that "
+            "all machines share, at the same path"
+        )
+
+
+@contextlib.contextmanager
+def _tokens(folders: Sequence[Path]) -> Iterator[dict[str, str]]:
+    """A new file in each folder, and its content."""
+    token = uuid.uuid4().hex
+    paths = [folder.absolute() / f".shared-{token}" for folder in folders]
+    try:
+        for path in paths:
+            write_atomic(path, lambda temporary: temporary.write_text(token))
+        yield {str(path): token for path in paths}
+    finally:
+        for path in paths:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,82 @@
+"""Fresh processes that compute with one thread each (loky)."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+from warmprior.io.extras import require
+from warmprior.io.workers import worker_died
+
+
+def available_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+_states: dict[str, Any] = {}
+"""Of this process: what jobs of :func:`working` work on."""
+
+
+def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
+    """A loky executor whose processes compute with one thread each, and end when this process ends.
+
+    They are no forks: nothing of this process is in them. Ctrl-C is left to this process.
+    """
+
+    def begin(parent: int) -> None:
+        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the other
+        # one imports this library, which takes seconds.
+        import os
+        import signal
+        import sys
+        import threading
+        import time
+
+        def watch() -> None:
+            while os.getppid() == parent:
+                time.sleep(0.2)
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
+        loky: Any = sys.modules["loky.process_executor"]
+        loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return require("loky", "sim").ProcessPoolExecutor(
+        max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
+    )
+
+
+@contextmanager
+def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]], Future[Any]]]:
+    """Processes that each hold a copy of a state; yields what submits ``job(state)``, both picklable.
+
+    Leaving the context with an error ends all of them at once. A ``WorkerError`` if a process dies.
+    """
+    executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
+    try:
+        yield lambda job: executor.submit(_on_state, name, pickled, job)
+    except BaseException as error:
+        executor.shutdown(kill_workers=True)
+        if isinstance(error, BrokenProcessPool):
+            worker = f"one of {count} workers"
+            raise worker_died(worker, "see above for its own error") from error
+        raise
+    executor.shutdown()
+
+
+def _on_state(name: str, pickled: bytes, job: Callable[[Any], Any]) -> Any:
+    if name not in _states:
+        _states[name] = pickle.loads(pickled)
+    return job(_states[name])

@@ -1,0 +1,376 @@
+"""Speed of the library as ratios to what it is built on, each measured in one run.
+
+python benchmarks/throughput.py                                  # everything, a few minutes
+python benchmarks/throughput.py --only windows_over_torch actor_over_network
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import socket
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed
+import torch.multiprocessing
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import TransformedEnv
+from tqdm import tqdm
+
+from lab.machine import facts_of_machine
+from warmprior import (
+    ChiTransformer,
+    Normalizer,
+    PastPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+    window_replay_buffer,
+)
+from warmprior.data import LeRobotExperienceReplay
+from warmprior.envs import RobosuiteEnv
+from warmprior.history import window_history
+from warmprior.io.distributed import joined, rank
+from warmprior.training import BehaviourCloning, TrainingConfig, precondition
+
+D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
+PRIOR = PastPrior(H)
+NFES = (1, 3, 9)
+
+
+class Clock:
+    """Times several things in turn, so that the machine's drift meets all of them alike."""
+
+    def __init__(self, repeats: int, bar: tqdm) -> None:
+        self.repeats, self.bar = repeats, bar
+
+    def times(
+        self, *things: Callable[[], object], calls: int = 1, before: Callable[[], object] = int
+    ) -> list[list[float]]:
+        """Seconds per call, ``[thing][repeat]``; ``before`` runs untimed ahead of each round."""
+        found: list[list[float]] = [[] for _ in things]
+        for repeat in range(self.repeats + 1):
+            before()
+            # Every other round runs backwards: neither is always the one after the other.
+            for i in range(len(things)) if repeat % 2 else reversed(range(len(things))):
+                start = time.perf_counter()
+                for _ in range(calls):
+                    things[i]()
+                    if torch.cuda.is_initialized():
+                        torch.cuda.synchronize()
+                if repeat:  # the first round warms up
+                    found[i].append((time.perf_counter() - start) / calls)
+            self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")
+        return found
+
+    def ratio(self, thing: Callable[[], object], base: Callable[[], object], **options: Any) -> float:
+        """Median of the rounds' time of ``thing`` over that of ``base``."""
+        one, two = self.times(thing, base, **options)
+        return statistics.median(a / b for a, b in zip(one, two, strict=True))
+
+
+# What is measured on
+
+
+def steps(episodes: int, length: int) -> TensorDict:
+    """Demonstrations of random numbers."""
+    n = episodes * length
+    both = torch.rand(n, D_O + D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    observation, action = both.split((D_O, D_A), dim=-1)
+    episode = torch.arange(n) // length
+    return TensorDict({"observation": observation, "action": action, "episode": episode}, [n]).contiguous()
+
+
+def one_decision(device: str = "cpu") -> TensorDict:
+    """What a policy is given for one decision."""
+    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
+    return TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
+
+
+def paper_network() -> ChiTransformer:
+    torch.manual_seed(0)
+    return ChiTransformer(D_A, D_O, PRIOR.prediction_length, TO)
+
+
+def small_network() -> VelocityMLP:
+    """That of the quick preset."""
+    torch.manual_seed(0)
+    return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
+
+
+def cloning(network: nn.Module, folder: str | Path, device: str = "cpu") -> BehaviourCloning:
+    """A training of the network, ready to step; on a GPU as CUDA graphs."""
+    actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=BATCH)
+    options: dict[str, Any] = {"observation_steps": TO, "compile": device == "cuda"}
+    training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, **options)
+    actor.train()
+    return training
+
+
+def step_of(network: nn.Module, device: str = "cpu") -> Callable[[], None]:
+    """A training step of a network alone, on random numbers; on a GPU as CUDA graphs."""
+    network.to(device)
+    if device == "cuda":
+        network.compile(mode="reduce-overhead")
+    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
+    shapes = (BATCH,), (BATCH, H, D_A), (BATCH, TO, D_O)
+    t, a, o = (torch.rand(shape, device=device) for shape in shapes)
+
+    def step() -> None:
+        if device == "cuda":
+            torch.compiler.cudagraph_mark_step_begin()
+        loss = network(t, a, o).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    return step
+
+
+# Windows
+
+
+def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor]]:
+    """Windows as one would write them in bare torch."""
+    observation, action, episode = (data[key] for key in ("observation", "action", "episode"))
+    length = int((episode == 0).sum())
+    before, ahead = torch.arange(1 - TO, 1), torch.arange(-H, H)
+
+    def sample() -> list[torch.Tensor]:
+        frame = torch.randint(len(data), (batch, 1))
+        start = frame - frame % length
+        index = frame + ahead
+        warm = index[:, :1] >= start
+        actions = action[index.clamp(start, start + length - 1)]
+        history, target = actions[:, :H], actions[:, H:]
+        observations = observation[(frame + before).clamp_min(start)]
+        is_pad = index[:, H:] >= start + length
+        return [observations, target, is_pad, history * warm.unsqueeze(-1), warm]
+
+    return sample
+
+
+def windows_over_torch(clock: Clock) -> dict[str, float]:
+    """Windows per second of the replay buffer over those of bare torch, by batch."""
+    data, found = steps(400, 200), {}
+    for batch in (BATCH, 1024):
+        buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
+        found[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
+    return found
+
+
+def lerobot_windows_over_getitem(clock: Clock) -> float | None:
+    """Windows of a LeRobotDataset, over those that its own ``__getitem__`` gives."""
+    os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
+    if not all(find_spec(name) for name in ("lerobot", "datasets", "pyarrow")):
+        tqdm.write("lerobot_windows_over_getitem: skipped, needs warmprior[lerobot]")
+        return None
+    logging.disable(logging.WARNING)  # about video decoders, which are not used here
+    from lerobot.datasets import LeRobotDataset
+
+    data, fps = steps(25, 200), 20
+    kind = {"dtype": "float32", "names": None}
+    features = {"observation.state": kind | {"shape": (D_O,)}, "action": kind | {"shape": (D_A,)}}
+    with tempfile.TemporaryDirectory() as folder:
+        root, name = Path(folder) / "data", "local/windows"
+        options = {"fps": fps, "features": features, "root": root}
+        written = LeRobotDataset.create(name, use_videos=False, **options)
+        for episode in data.view(25, 200):
+            for row in episode:
+                state, action = row["observation"].numpy(), row["action"].numpy()
+                written.add_frame({"observation.state": state, "action": action, "task": "none"})
+            written.save_episode()
+        written.finalize()
+        offsets = {
+            "action": [i / fps for i in range(-H, H)],
+            "observation.state": [i / fps for i in range(1 - TO, 1)],
+        }
+        theirs = LeRobotDataset(name, root=root, delta_timestamps=offsets)
+        read = LeRobotExperienceReplay(root).data
+        buffer = window_replay_buffer(read, PRIOR, batch_size=BATCH, observation_steps=TO)
+        ratio = clock.ratio(
+            lambda: [theirs[i] for i in torch.randint(len(data), (64,)).tolist()],
+            lambda: [buffer.sample() for _ in range(20)],
+        )
+    return ratio * 20 * BATCH / 64
+
+
+# Training
+
+
+def train_step_over_network(clock: Clock, device: str = "cpu", calls: int = 1) -> float | None:
+    if device == "cuda" and not torch.cuda.is_available():
+        tqdm.write("cuda_train_step_over_network: skipped, needs a GPU")
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        ours = cloning(paper_network(), folder, device).step
+        return clock.ratio(ours, step_of(paper_network(), device), calls=calls)
+
+
+def preconditioning_over_network(clock: Clock) -> float:
+    network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
+    return clock.ratio(step_of(network), step_of(small_network()), calls=20)
+
+
+SCALED = {"paper": (paper_network, 1), "small": (small_network, 10)}
+"""Networks, and training steps per round."""
+
+
+def _round(step: Callable[[], object], calls: int) -> torch.Tensor:
+    """Seconds, and seconds of processor time."""
+    start = time.perf_counter(), time.process_time()
+    for _ in range(calls):
+        step()
+    return torch.tensor([time.perf_counter() - start[0], time.process_time() - start[1]])
+
+
+def _scale(number: int, port: int, repeats: int, folder: str) -> None:
+    """In turn: the first process trains alone while the other waits, and both train together."""
+    torch.set_num_threads(1)
+    os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": "2"}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    alone = {name: cloning(make(), Path(folder) / name) for name, (make, _) in SCALED.items()}
+    with joined():
+        for name, (make, calls) in SCALED.items():
+            both, found = cloning(make(), Path(folder) / f"{name} {number}"), []
+            for repeat in range(repeats + 1):
+                torch.distributed.barrier()
+                one = _round(alone[name].step, calls) if not rank() else torch.zeros(2)
+                torch.distributed.barrier()
+                two = _round(both.step, calls)
+                torch.distributed.all_reduce(two)
+                if repeat:  # the first round warms up
+                    found.append(one / two)
+            if not rank():
+                torch.save(torch.stack(found).median(0).values, Path(folder) / f"{name}.pt")
+
+
+def ddp_efficiency(clock: Clock) -> dict[str, dict[str, float]]:
+    """Windows per second of two processes of a thread, over twice those of one, at the same whole batch.
+
+    By time, and by processor time, which tells what sharing a batch costs where other work takes the cores.
+    """
+    with socket.socket() as free, tempfile.TemporaryDirectory() as folder:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        torch.multiprocessing.spawn(_scale, (port, clock.repeats, folder), nprocs=2)
+        found = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
+    return {name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()}
+
+
+# Decisions
+
+
+@torch.no_grad()
+def actor_over_network(clock: Clock) -> dict[str, float]:
+    network = paper_network().eval()
+    actor = WarmPriorActor(network, PRIOR).eval()
+    data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
+    found = {}
+    for nfe in NFES:
+        found[str(nfe)] = clock.ratio(
+            partial(actor, data, nfe=nfe),
+            lambda nfe=nfe: [network(t, a, data["observation"]) for _ in range(nfe)],
+            calls=max(2, 18 // nfe),
+        )
+    return found
+
+
+# Control steps
+
+
+def env_over_robosuite(clock: Clock) -> float:
+    envs = RobosuiteEnv("square"), RobosuiteEnv("square", control_loop="robosuite")
+    lean, own = (env.loop for env in envs)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, D_A))
+
+    def before() -> None:  # the same episode on both sides: contacts decide what a step costs
+        lean.reset(0)
+        own.reset(0)
+
+    return clock.ratio(
+        lambda: [own.env.step(action) for action in actions],
+        lambda: [lean.step(action) for action in actions],
+        before=before,
+    )
+
+
+def chunk_step_overhead(clock: Clock) -> float:
+    # Statistics that leave actions as they are, so that both sides simulate the same.
+    high = {"observation": torch.ones(D_O), "action": torch.ones(D_A)}
+    normalizer = Normalizer({key: -value for key, value in high.items()}, high)
+    alone, wrapped = RobosuiteEnv("square"), RobosuiteEnv("square")  # of 400 steps; 40 are taken
+    env = TransformedEnv(wrapped, policy_transforms(PRIOR, normalizer=normalizer))
+    chunks = torch.rand(5, H, D_A, generator=torch.Generator().manual_seed(0)) * 0.6 - 0.3
+    data = None
+
+    def before() -> None:
+        nonlocal data
+        env.set_seed(0, static_seed=True)
+        data = env.reset()
+        alone.loop.reset(0)
+
+    def decisions() -> None:
+        nonlocal data
+        for chunk in chunks:
+            data = env.step_mdp(env.step(data.set(("vla_action", "chunk"), chunk)))
+
+    actions = chunks.flatten(0, 1).numpy()
+    return clock.ratio(decisions, lambda: [alone.loop.step(a) for a in actions], before=before) - 1
+
+
+FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
+    "windows_over_torch": (windows_over_torch, ">= 0.6"),
+    "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
+    "train_step_over_network": (train_step_over_network, "<= 1.10"),
+    "cuda_train_step_over_network": (partial(train_step_over_network, device="cuda", calls=20), "<= 1.05"),
+    "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
+    "ddp_efficiency": (ddp_efficiency, ""),
+    "actor_over_network": (actor_over_network, "<= 1.10"),
+    "env_over_robosuite": (env_over_robosuite, ">= 2"),
+    "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add = parser.add_argument
+    add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"of {', '.join(FIGURES)}")
+    add("--out", type=Path, default=Path("runs/throughput"), help="folder of throughput.json")
+    add("--repeats", type=int, default=11, help="rounds per figure (default: 11)")
+    options = parser.parse_args(argv)
+    if options.repeats < 1:
+        parser.error("--repeats must be at least 1")
+    torch.set_num_threads(1)
+    path = options.out / "throughput.json"
+    options.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = dict.fromkeys(FIGURES)
+    with tqdm(options.only or list(FIGURES), unit="figure", dynamic_ncols=True) as bar:
+        for name in bar:
+            bar.set_description(name)
+            measure, target = FIGURES[name]
+            results[name] = value = measure(Clock(options.repeats, bar))
+            shown = f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
+            tqdm.write(f"{name:32} {shown} {f'(target {target})' if target else ''}")
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    results["meta"] = facts_of_machine(torch_threads=torch.get_num_threads(), date=date)
+    path.write_text(json.dumps(results, indent=2) + "\n")
+    print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

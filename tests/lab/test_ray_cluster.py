@@ -1,0 +1,54 @@
+"""A Ray cluster: what is none, and machines that could not do the work, are refused at once."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+
+import pytest
+
+from lab import ray_cluster as module
+from lab.ray_cluster import check_ray, ray_cluster
+from tests.processes import apart
+
+pytest.importorskip("ray")
+
+
+@pytest.mark.slow  # a cluster takes most of a minute to start, and minutes on a busy machine
+@apart
+def test_machines_look_for_modules_where_this_process_does(ray_address, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "users_own_module.py").write_text("def answer():\n    return 42\n")
+    import users_own_module
+
+    with ray_cluster(ray_address, folders=[tmp_path]) as ray:
+        assert ray.get(ray.remote(users_own_module.answer).remote()) == 42
+        with ray_cluster() as same:  # the connection that is there
+            assert same is ray
+        assert ray.is_initialized()
+    assert not ray.is_initialized() and not list(tmp_path.glob(".shared-*"))
+
+
+def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
+    started = time.monotonic()
+    with pytest.raises(ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"):
+        check_ray("127.0.0.1:1")
+    for address in ("localhost", "ray://head:10001"):
+        with pytest.raises(ValueError, match="HOST:PORT"):
+            check_ray(address)
+    assert time.monotonic() - started < 5
+    monkeypatch.setattr(module, "PATIENCE", 3.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
+        with pytest.raises(ConnectionError, match="does not answer within 3 seconds"):
+            check_ray()
+    monkeypatch.delenv("RAY_ADDRESS")
+    assert check_ray() is None
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    for attempt in (check_ray, lambda: ray_cluster().__enter__()):
+        with pytest.raises(ImportError, match=r"ray is not installed.*warmprior\[ray\]"):
+            attempt()

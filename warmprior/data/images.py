@@ -1,0 +1,121 @@
+"""Whether the images of demonstrations show what the simulator shows."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from importlib.metadata import version
+
+import numpy as np
+
+from warmprior.data.hdf5 import read_origin
+from warmprior.data.lerobot_index import LeRobotIndex
+from warmprior.data.opening import Demonstrations
+from warmprior.data.replay import DatasetError, DatasetIndex
+from warmprior.envs.env_args import modernize_env_args
+from warmprior.envs.rendering import CameraRenderer
+from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
+from warmprior.keys import OBSERVATION
+
+RENDERER_VERSION = 2
+"""Part of what images depend on; raised whenever the same states give other ones."""
+
+CLEARLY = 8.0
+"""Mean difference of two images, of 255, from which on they show something else."""
+
+
+def renderer_versions() -> tuple[int | str, ...]:
+    """What the same states' images depend on, beside how they are asked for."""
+    return RENDERER_VERSION, version("mujoco"), version("robosuite")
+
+
+class StateRenderer:
+    """Renders the states of demonstrations; its simulator is made when it is first needed."""
+
+    def __init__(self, index: DatasetIndex, size: int, fast: bool) -> None:
+        self.index, self.size, self.fast = index, size, fast
+
+    @cached_property
+    def renderer(self) -> CameraRenderer:
+        """Of the simulator's model, in which nothing may depend on a reset."""
+        env = make_simulator(modernize_env_args(self.index.env_args))
+        placed = []
+        with isolated_numpy_seed(0):
+            for _ in range(2):
+                env.reset()  # which hides the grippers' markers, too, that no episode shows
+                model = env.sim.model._model
+                placed.append(np.concatenate([model.body_pos, model.body_quat], -1))
+        if not np.array_equal(*placed):
+            raise DatasetError(
+                f"{self.index.path}: {self.index.env_args['env_name']} moves fixtures at every reset, and "
+                "states do not tell where to: its images cannot be rendered from them"
+            )
+        return CameraRenderer(model, self.size, self.size, fast=self.fast)
+
+    def joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:
+        """Positions of all joints, ``[steps, nq]``, in states of this simulator."""
+        model = self.renderer.model
+        expected = (steps, 1 + model.nq + model.nv)
+        if states.shape != expected:
+            raise DatasetError(
+                f"{what} has shape {states.shape}, but the simulator of "
+                f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
+            )
+        usable = np.isfinite(states).all(-1)
+        if not usable.all():  # MuJoCo would show something all the same
+            raise DatasetError(
+                f"{what} has NaN or infinity in row {int(np.argmin(usable))}: record it again, or leave the "
+                "demo out"
+            )
+        return states[:, 1 : 1 + model.nq]
+
+    def compare(self, state: Sequence[float], images: Mapping[str, np.ndarray], advice: str) -> None:
+        """Compare images of a state, by camera, with the simulator's."""
+        name = self.index.path
+        (joints,) = self.joints(np.array([state], np.float64), 1, f"{name}: the first state")
+        for camera, image in images.items():
+            shown = self.renderer.render(camera, joints).astype(np.float32)
+            stored = image.astype(np.float32)
+            views = {
+                "show something else than the simulator": stored,
+                "are upside down": stored[::-1],
+                "have red and blue exchanged": stored[..., ::-1],
+            }
+            off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
+            (as_stored, *_), view = off.values(), min(off, key=lambda name: off[name])
+            # Most of a scene may look alike upside down, and have little colour.
+            other = as_stored > 1 and off[view] < as_stored / 2
+            if other or as_stored > CLEARLY:
+                view = view if other else next(iter(views))
+                raise DatasetError(
+                    f"{name}: the images of {camera} {view} ({as_stored:.0f} of 255 off on average). "
+                    f"Policies would see other ones in evaluation: {advice}"
+                )
+
+
+def check_images(found: Demonstrations, cameras: Sequence[str], fast: bool) -> None:
+    """Compare the first images of some cameras with what the simulator shows there.
+
+    A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
+    """
+    keys = [f"{camera}_image" for camera in cameras]
+    index = found.index(image_keys=keys, demos=1)
+    if isinstance(index, LeRobotIndex):
+        rendering, state = (index.described.get(name) for name in ("rendering", "first_state"))
+    else:
+        rendering, state = read_origin(index.path, index.demos[0])
+    if rendering is not None and bool(rendering["fast"]) != fast:
+        raise DatasetError(
+            f"{index.path}: its images were rendered {'in full quality' if fast else 'fast'}, and in "
+            f"evaluation they would not be: take fast_rendering={not fast}"
+        )
+    if state is None:
+        warnings.warn(
+            f"{index.path} holds no states: its images could not be compared with the simulator's",
+            stacklevel=2,
+        )
+        return
+    first = found.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
+    images = {camera: first[f"{camera}_image"].permute(1, 2, 0).numpy() for camera in cameras}
+    StateRenderer(index, index.image_size, fast).compare(state, images, "render these anew")

@@ -1,0 +1,93 @@
+"""A task of the demonstrations in a file, played in the simulator that recorded them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from warmprior.data.images import check_images
+from warmprior.data.opening import Demonstrations
+from warmprior.data.replay import DatasetIndex, DemonstrationReplay
+from warmprior.envs.description import environment_description, robosuite_parts
+from warmprior.envs.simulator import task_env_args
+from warmprior.envs.tasks import TASKS
+from warmprior.keys import ACTION, OBSERVATION, STATE
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.preconditioning import RestingAction
+from warmprior.transforms.absolute_actions import AbsoluteActions
+
+
+def opened(place: Path | str, task: str | None = None, mask: str | None = None) -> Demonstrations:
+    """The demonstrations at a place; the task's environment is theirs where they do not say."""
+    return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
+
+
+def task_name(dataset: DemonstrationReplay | DatasetIndex) -> str:
+    """Short name of a dataset's task, or the environment's where it is none of ours."""
+    task = dataset.task
+    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
+
+
+def image_names(cameras: Sequence[str]) -> list[str]:
+    """The names of the cameras' images in files."""
+    return [f"{camera}_image" for camera in cameras]
+
+
+def recorded_task(
+    dataset: DemonstrationReplay,
+    images: Mapping[str, Any] | None,
+    *,
+    style: str,
+    observation_steps: int,
+    actions: Literal["delta", "absolute"],
+) -> dict[str, Any]:
+    """Data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
+    description = environment_description(dataset.env_args, style, observation_steps, actions, images)
+    make_env, adapters = robosuite_parts(description)
+    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
+    # positions, which range far, do not weigh little beside the gripper in the loss.
+    absolute = adapters.get("actions")
+    units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
+    vector = OBSERVATION if images is None else (OBSERVATION, STATE)
+    normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
+    data = normalizer.normalize(dataset.data.exclude("next"))
+    return {
+        "data": data,
+        "make_env": make_env,
+        "normalizer": normalizer,
+        "adapters": adapters,
+        "rest": None if absolute is None else RestingAction(dataset.pose_columns, normalizer),
+        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
+        "clip": 1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
+        "environment": description,
+    }
+
+
+def read_steps(
+    found: Demonstrations,
+    *,
+    absolute_actions: bool = False,
+    observation_keys: Sequence[str] | None = None,
+    cameras: Sequence[str] = (),
+    fast_rendering: bool = False,
+    demos: int | None = None,
+) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
+    """The demonstrations as policies are to see them, and what images are among it, if any."""
+    if not cameras:
+        options: Mapping[str, Any] = {"absolute_actions": absolute_actions}
+        return found.replay(**options, observation_keys=observation_keys, demos=demos), None
+    if absolute_actions:
+        raise ValueError("images go with pose deltas: leave out actions='absolute', or the cameras")
+    check_images(found, cameras, fast_rendering)
+    # What robomimic's image policies see besides: the robot, and not where the objects are.
+    vector = [key for key in found.index(demos=demos).observation_keys if key != "object"]
+    vector = vector if observation_keys is None else list(observation_keys)
+    names = image_names(cameras)
+    dataset = found.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
+    return dataset, {
+        "cameras": list(cameras),
+        "size": dataset.image_size,
+        "fast_rendering": fast_rendering,
+        "low_dim_keys": vector,
+    }
