@@ -251,4 +251,4 @@ def test_a_mean_of_another_shape_or_type(wrong):
         ):
             Wrong(3).distribution(random_history(PastPrior(3), 4))
     finally:
-        del Prior._classes["wrong-for-this-test"]
+        del Prior.classes["wrong-for-this-test"]

@@ -125,5 +125,9 @@ def test_an_argument_called_name_is_refused():
     class Named(Thing):
         def __init__(self, name): ...
 
-    with pytest.raises(TypeError, match="an argument called name"):
-        Named("x").config()
+    class Forgetful(Thing):
+        def __init__(self, radius): ...
+
+    for thing, argument in ((Named("x"), "name"), (Forgetful(1.0), "radius")):
+        with pytest.raises(TypeError, match=argument):
+            thing.config()

@@ -135,9 +135,10 @@ class Halfway(StartPoint):
     name = "halfway-of-the-tests"
     time = noise_share = 0.5
 
-    def __init__(self, shift=0.0):
+    def __init__(self, initial=0.0):
         nn.Module.__init__(self)
-        self.shift = nn.Parameter(torch.full((), shift))
+        self.initial = initial
+        self.shift = nn.Parameter(torch.full((), initial))
 
     def centre(self, history, observation):
         return history["actions"][..., -1:, :].expand_as(history["forecast"]) + self.shift

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.modules.registry import make
+from warmprior.modules.option_text import make
 from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 

@@ -42,7 +42,7 @@ class Learner(nn.Module):
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
         """Make the networks, if the widths of the data are known."""
         check_whole_numbers(hidden_dim=hidden_dim)
-        self.hidden_dim = hidden_dim
+        self.widths, self.hidden_dim = widths, hidden_dim
         if widths is not None:
             self.action_dim, self.observation_dim, self.observation_steps = widths
             self.chunk_dim = self.chunk_length * self.action_dim
@@ -215,7 +215,7 @@ class CVAEPrior(LearnedPrior):
     ) -> None:
         check_whole_numbers(latent_dim=latent_dim)
         check_positive(beta=beta)
-        self.__dict__.update(latent_dim=latent_dim, beta=beta)
+        self.latent_dim, self.beta = latent_dim, beta
         super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
 
     def build(self) -> None:
@@ -281,7 +281,8 @@ class ForecastStart(StartPoint, Learner):
             raise ValueError(f"need 0 < start_time < 1 and stall >= 0, got {start_time} and {stall}")
         nn.Module.__init__(self)
         self.chunk_length = chunk_length
-        self.time, self.noise_share = start_time, 1.0 - start_time
+        self.start_time = self.time = start_time
+        self.noise_share = 1.0 - start_time
         self.stall, self.stall_noise = stall, stall_noise
         self._set_widths(widths, hidden_dim)
 

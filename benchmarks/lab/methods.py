@@ -28,8 +28,8 @@ import torch
 from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorActor
 from warmprior.io.files import digest_of
+from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
-from warmprior.modules.registry import find, options_of
 from warmprior.objectives import BridgeCoupling, Coupling, OTCoupling, ReflowCoupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
@@ -42,7 +42,7 @@ class ColdPrior(GaussianPrior):
 
     def __init__(self, chunk_length: int, chunks: int) -> None:
         super().__init__(chunk_length)
-        self.prediction_chunks = chunks
+        self.chunks = self.prediction_chunks = chunks
 
 
 class PointPrior(GaussianPrior):

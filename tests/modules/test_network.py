@@ -17,6 +17,7 @@ from warmprior.modules.registry import from_config
 class Linear(VelocityNetwork):
     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps=2, *, k=3):
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        self.k = k
         self.position = nn.Parameter(torch.zeros(1, prediction_length, action_dim))
         self.layer = nn.Linear(action_dim, action_dim)
         self.norm = nn.LayerNorm(action_dim)

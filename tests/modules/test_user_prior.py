@@ -10,7 +10,8 @@ from torch import nn
 
 from tests.toy_env import demonstrations
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder, VelocityMLP, WarmPriorActor
-from warmprior.modules.registry import find, from_config, make, options_of
+from warmprior.modules.option_text import find, make, options_of
+from warmprior.modules.registry import from_config
 from warmprior.training import BehaviourCloning, TrainingConfig
 from warmprior.training.saved import load_policy
 
@@ -24,11 +25,11 @@ class Anchor(PastPrior):
 
     def __init__(self, chunk_length, *, gain, offsets=(0.0,), **options):
         super().__init__(chunk_length, **options)
-        self.scale = gain
+        self.gain, self.offsets = gain, list(offsets)
 
     def mean(self, history):
         loc, warm = super().mean(history)
-        return self.scale * loc, warm
+        return self.gain * loc, warm
 
 
 class Learned(PastPrior, nn.Module):
@@ -39,6 +40,7 @@ class Learned(PastPrior, nn.Module):
     def __init__(self, chunk_length, *, action_dim=D_A):
         nn.Module.__init__(self)
         super().__init__(chunk_length)
+        self.action_dim = action_dim
         self.shift = nn.Parameter(torch.zeros(action_dim))
         self.register_buffer("offset", torch.zeros(()))
 
@@ -62,10 +64,13 @@ def test_arguments_of_its_own_are_part_of_its_configuration():
         "gain": 0.5,
         "offsets": [1.0, 2.0],
         "sigma": 0.3,
+        "correlation": 0.0,
     }
     again = from_config(Prior, config)
-    assert type(again) is Anchor and again.config() == config and again.scale == 0.5
-    assert repr(again) == f"Anchor(chunk_length={H}, gain=0.5, offsets=[1.0, 2.0], sigma=0.3)"
+    assert type(again) is Anchor and again.config() == config and again.gain == 0.5
+    assert (
+        repr(again) == f"Anchor(chunk_length={H}, gain=0.5, offsets=[1.0, 2.0], sigma=0.3, correlation=0.0)"
+    )
 
 
 def test_the_same_prior_has_one_configuration():

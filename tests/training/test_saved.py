@@ -107,7 +107,7 @@ def test_a_user_s_prior_travels(tmp_path):
 
     saved(tmp_path, Still(H))
     assert type(load_policy(tmp_path).prior) is Still
-    del Prior._classes["still-for-this-test"]
+    del Prior.classes["still-for-this-test"]
     with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*import the module"):
         load_policy(tmp_path)
 

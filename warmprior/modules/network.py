@@ -238,6 +238,8 @@ class VelocityMLP(VelocityNetwork):
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         check_whole_numbers(hidden_dim=hidden_dim, num_blocks=num_blocks)
+        self.hidden_dim, self.num_blocks = hidden_dim, num_blocks
+        self.timestep_embedding_dim = timestep_embedding_dim
         chunk = prediction_length * action_dim
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim),
@@ -291,6 +293,7 @@ class PlainMLP(VelocityNetwork):
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         check_whole_numbers(hidden_dim=hidden_dim)
+        self.hidden_dim = hidden_dim
         chunk = prediction_length * action_dim
         inputs = 1 + chunk + observation_steps * observation_dim
         self.layers = MLP(inputs, chunk, depth=3, num_cells=hidden_dim, activation_class=nn.GELU)
@@ -359,6 +362,8 @@ class ChiTransformer(VelocityNetwork):
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         _check_sizes(num_heads, embedding_dim, num_layers)
+        self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
+        self.timestep_embedding_dim, self.dropout = timestep_embedding_dim, dropout
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
         )
@@ -476,6 +481,8 @@ class AdaLNTransformer(VelocityNetwork):
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         _check_sizes(num_heads, embedding_dim, num_layers)
+        self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
+        self.timestep_embedding_dim = timestep_embedding_dim
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
         )

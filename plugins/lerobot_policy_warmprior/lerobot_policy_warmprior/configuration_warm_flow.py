@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
-from warmprior.modules.registry import make
+from warmprior.modules.option_text import make
 from warmprior.training import warmup_cosine
 
 

@@ -10,7 +10,7 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
-from warmprior.modules.registry import find, make
+from warmprior.modules.option_text import find, make
 
 
 @dataclass

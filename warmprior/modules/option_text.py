@@ -1,0 +1,76 @@
+"""What a user types for a registered class: its name, and options behind it."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import re
+from typing import Any
+
+from warmprior.modules.registry import Registered, kind, registered
+
+__all__ = ["find", "make", "options_of"]
+
+
+def find[T: Registered](base: type[T], name: str) -> type[T]:
+    """Return the subclass of a name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
+
+    Importing runs code, so use this for names that a user typed, and never for names in a file. A
+    ``ValueError`` if there is none, or it is a base class.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        return registered(base, name, "name your own as package.module:Class")
+    try:
+        cls = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"there is no {kind(base)} at {name}: {error}") from error
+    if cls not in base.classes.values():
+        raise ValueError(f"{name} is no {kind(base)} that can be built")
+    return cls
+
+
+def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
+    """Build what a user typed: a name as for :func:`find`, and options behind it, as in :func:`options_of`.
+
+    ``args`` are further arguments of the constructor. A ``ValueError`` names what is wrong and what the
+    constructor takes.
+
+    Examples:
+        >>> from warmprior.modules.option_text import make
+        >>> from warmprior import Prior
+        >>> make(Prior, "past,correlation=0.5", 8)
+        PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
+    """
+    cls, options = find(base, text.partition(",")[0]), options_of(text)
+    try:
+        return cls(*args, **options)
+    except (TypeError, ValueError, ArithmeticError) as error:
+        written = ", ".join([*map(repr, args), *(f"{n}={v!r}" for n, v in options.items())]) or "nothing"
+        taken = ", ".join(list(inspect.signature(cls.__init__).parameters)[1:]) or "nothing"
+        raise ValueError(
+            f"{cls.__name__} cannot be built from {written} ({error}): it takes {taken}"
+        ) from error
+
+
+def options_of(text: str) -> dict[str, Any]:
+    """Return the options of ``name,option=value,...``, as JSON or plain text.
+
+    A comma separates options if ``option=`` follows, and belongs to the value otherwise. A ``ValueError``
+    if the text has another form.
+    """
+    options: dict[str, Any] = {}
+    _, comma, rest = text.partition(",")
+    for part in re.split(r",(?=\s*[^\W\d]\w*\s*=)", rest) if comma else ():
+        key, equals, value = part.partition("=")
+        key = key.strip()
+        if not equals or not key.isidentifier():
+            raise ValueError(f"options are written as name,option=value, got {part!r} in {text!r}")
+        if key in options:
+            raise ValueError(f"the option {key} is given twice in {text!r}")
+        try:
+            options[key] = json.loads(value)
+        except json.JSONDecodeError:
+            options[key] = value
+    return options
