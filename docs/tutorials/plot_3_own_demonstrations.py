@@ -33,7 +33,7 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.data import LeRobotExperienceReplay, RobomimicExperienceReplay
+from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations
 from warmprior.training import (
     BehaviourCloning,
     TrainingConfig,
@@ -106,7 +106,7 @@ with h5py.File(root / "swing_up.hdf5", "w") as file:
         demo["rewards"] = episode["rewards"]
         demo["obs/state"] = episode["state"]
 
-replay = RobomimicExperienceReplay(
+replay = RobomimicDemonstrations(
     root / "swing_up.hdf5", observation_keys=["state"]
 )
 demos = replay.data
@@ -141,7 +141,7 @@ for episode in episodes[:5]:
     dataset.save_episode()
 dataset.finalize()
 
-same = LeRobotExperienceReplay(root / "lerobot").data
+same = LeRobotDemonstrations(root / "lerobot").data
 first = demos[: len(same)]
 for key in ("observation", "action", "episode"):
     print(key, "is the same:", bool((same[key] == first[key]).all()))

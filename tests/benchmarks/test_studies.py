@@ -25,7 +25,7 @@ import robomimic
 import sigma
 
 from tests.benchmarks import drift
-from warmprior.data import RobomimicExperienceReplay
+from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import load_policy
 
@@ -131,7 +131,7 @@ def test_every_budget_is_a_training_of_its_own(dataset, validation, tmp_path):
     # The errors are those of the policies on disk, each trained for its own number of iterations.
     for (n, _, nfe), row in cells.items():
         actor = load_policy(out.parent / "policies" / row["policy"] / f"policy_{n:06d}")
-        replay = RobomimicExperienceReplay(validation).data.exclude("next")
+        replay = RobomimicDemonstrations(validation).data.exclude("next")
         shared = SharedObservations(actor.normalizer.normalize(replay), 8, observation_steps=2)
         error = action_error(actor, shared.windows(actor.prior), nfes=(nfe,))[nfe]
         assert row["action_error"] == pytest.approx(error, rel=0.3)  # any draw of 20 is close

@@ -11,7 +11,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from warmprior.data import DatasetError, LeRobotExperienceReplay, RobomimicExperienceReplay, convert_robomimic
+from warmprior.data import DatasetError, LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,7 +68,7 @@ def test_both_buffers_hold_the_same(converted, options):
     path, folders = converted
     theirs, mine = (
         kind(place, **options)
-        for kind, place in ((RobomimicExperienceReplay, path), (LeRobotExperienceReplay, folders["image"]))
+        for kind, place in ((RobomimicDemonstrations, path), (LeRobotDemonstrations, folders["image"]))
     )
     assert not equal(mine.data, theirs.data)
     assert mine.env_args == theirs.env_args and mine.task is theirs.task
@@ -80,7 +80,7 @@ def test_lerobot_reads_what_was_converted(converted):
     from lerobot.datasets import LeRobotDataset
 
     path, folders = converted
-    data = RobomimicExperienceReplay(path).data
+    data = RobomimicDemonstrations(path).data
     for kind, folder in folders.items():
         dataset = LeRobotDataset("local/test", root=folder)
         assert dataset.fps == 20 and dataset.num_episodes == 3 and len(dataset) == 16
@@ -125,7 +125,7 @@ def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypat
     left.mkdir(parents=True)
     (left / "info.json").write_text("{")
     assert convert_robomimic(path, folder) == folder
-    assert len(LeRobotExperienceReplay(folder)) == 16
+    assert len(LeRobotDemonstrations(folder)) == 16
     assert [p.name for p in folder.parent.iterdir()] == ["data"]
 
 
@@ -134,9 +134,9 @@ def test_what_cannot_be_converted(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         convert_robomimic(path, folder)
     write_robomimic_file(path, task="lift", lengths=(3,))
-    with pytest.raises(ValueError, match="images must be one of image, video or None, got 'gif'"):
+    with pytest.raises(ValueError, match="images must be one of image, video, got 'gif'"):
         convert_robomimic(path, folder, images="gif")
-    with pytest.raises(ValueError, match="images of 4 pixels are too small for a video, which takes 32"):
+    with pytest.raises(ValueError, match="a video needs 32 pixels, not 4"):
         convert_robomimic(path, folder, images="video")
     with h5py.File(path, "a") as file:
         del file["data/demo_0/obs/agentview_image"]

@@ -27,9 +27,9 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
     assert read_index(path, demos=11).demos == tuple(f"demo_{n}" for n in range(11))
     assert read_index(path, demos=2, filter_key="late").demos == ("demo_3", "demo_10")
-    with pytest.raises(DatasetError, match=r"file\.hdf5: there are 12 demonstrations, fewer than the 13"):
+    with pytest.raises(DatasetError, match=r"file\.hdf5: .*12 demonstrations.*demos=13"):
         read_index(path, demos=13)
-    with pytest.raises(ValueError, match="demos must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"demos must be .*at least 1, got 0"):
         read_index(path, demos=0)
 
 
@@ -47,7 +47,9 @@ def test_unknown_environment_uses_what_it_finds(tmp_path):
     )
 
     for nothing in [], ():
-        with pytest.raises(DatasetError, match=r"file\.hdf5: no observations are chosen; .*robot0_eef_pos"):
+        with pytest.raises(
+            DatasetError, match=r"file\.hdf5: no observations are chosen.*observation_keys.*robot0_eef_pos"
+        ):
             read_index(path, observation_keys=nothing)
 
 
@@ -64,23 +66,23 @@ def test_truncated_file(square_file, keep):
     path, _ = square_file
     content = path.read_bytes()
     path.write_bytes(b"<html>please log in" if keep is None else content[: int(keep * len(content))])
-    with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*download it again"):
+    with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*again"):
         read_index(path)
 
 
 def test_filter_keys(square_file, tmp_path):
     path, _ = square_file
-    with pytest.raises(DatasetError, match=r"unknown filter key 'better'.*empty, train, valid"):
+    with pytest.raises(DatasetError, match=r"filter key 'better'.*empty, train, valid"):
         read_index(path, filter_key="better")
     with pytest.raises(DatasetError, match="mask/empty names no demos"):
         read_index(path, filter_key="empty")
     with h5py.File(path, "a") as file:
         del file["data/demo_2"]
-    with pytest.raises(DatasetError, match=r"mask/train names demos .* demo_2"):
+    with pytest.raises(DatasetError, match=r"mask/train names .*demo_2"):
         read_index(path, filter_key="train")
     bare = tmp_path / "bare.hdf5"
     write_robomimic_file(bare)
-    with pytest.raises(DatasetError, match="'train'; this dataset has none"):
+    with pytest.raises(DatasetError, match=r"'train'.* none"):
         read_index(bare, filter_key="train")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
-from warmprior.data import DatasetError, RobomimicExperienceReplay
+from warmprior.data import DatasetError, RobomimicDemonstrations
 from warmprior.data.hdf5 import read_index
 
 
@@ -90,7 +90,7 @@ FAULTS = {
     ),
     "no data": (lambda f, folder: f.move("data", "elsewhere"), ["no group 'data'", "elsewhere"]),
     "no demos": (_no_demos, ["no demos"]),
-    "no env_args": (lambda f, folder: f["data"].attrs.pop("env_args"), ["env_args", "copy it"]),
+    "no env_args": (lambda f, folder: f["data"].attrs.pop("env_args"), ["env_args", "locate"]),
     "other name": (lambda f, folder: f.move("data/demo_1", "data/second"), ["data/second", "rename"]),
     "no key": (without("obs/object"), ["data/demo_1", "obs/object", "robot0_eef_pos"]),
     "short object": (replaced("obs/object", np.zeros((4, 14))), [OBJECT, "(4, 14)", "5 rows", "mask"]),
@@ -129,7 +129,7 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
     with pytest.raises(DatasetError, match=r"square\.hdf5: data/demo_1/actions: its .* again"):
-        RobomimicExperienceReplay(path)
+        RobomimicDemonstrations(path)
 
 
 def test_values_whose_storage_ends_before_they_do(square_file):
@@ -141,7 +141,7 @@ def test_values_whose_storage_ends_before_they_do(square_file):
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<2Q", place, 5 * 7 * 8 - 8)))
     with pytest.raises(DatasetError, match=r"square\.hdf5: data/demo_1/actions .* never written"):
-        RobomimicExperienceReplay(path)
+        RobomimicDemonstrations(path)
 
 
 @pytest.mark.parametrize(
@@ -171,9 +171,9 @@ def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monk
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
     monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed - 1)
     with pytest.raises(DatasetError, match=r"square\.hdf5: 47 steps .*memmap"):
-        RobomimicExperienceReplay(path)
+        RobomimicDemonstrations(path)
     monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed)
-    RobomimicExperienceReplay(path)
+    RobomimicDemonstrations(path)
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e39, -1e38, 1e10])
@@ -184,7 +184,7 @@ def test_values_that_no_robot_has(square_file, key, value):
     with h5py.File(path, "a") as file:
         file[f"data/demo_2/{key}"][17, ...] = value
     with pytest.raises(DatasetError, match=rf"square\.hdf5: data/demo_2/{key} .* row 17\b"):
-        RobomimicExperienceReplay(path)
+        RobomimicDemonstrations(path)
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0.9, 0, 0, 0)])
@@ -192,11 +192,11 @@ def test_absolute_actions_need_unit_quaternions(square_file, quaternion):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         file["data/demo_1/obs/robot0_eef_quat"][3] = quaternion
-    RobomimicExperienceReplay(path)
+    RobomimicDemonstrations(path)
     with pytest.raises(
         DatasetError, match=r"square\.hdf5: data/demo_1/obs/robot0_eef_quat .* row 3\b.*length"
     ):
-        RobomimicExperienceReplay(path, absolute_actions=True)
+        RobomimicDemonstrations(path, absolute_actions=True)
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -212,7 +212,7 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
 
     options = {"storage": "memmap", "scratch_dir": tmp_path / "maps" if named else None}
     monkeypatch.setattr(os, "posix_fallocate", count)
-    data = RobomimicExperienceReplay(path, **options).data
+    data = RobomimicDemonstrations(path, **options).data
     sizes = [v.numel() * v.element_size() for v in data.values(True, True)]
     assert sorted(taken) == sorted(sizes)
 
@@ -222,4 +222,4 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
     monkeypatch.setattr(os, "posix_fallocate", full)
     monkeypatch.setattr("warmprior.data.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled"))
     with pytest.raises(OSError, match=r"(maps|temporary files): cannot take .*scratch_dir"):
-        RobomimicExperienceReplay(path, **options)
+        RobomimicDemonstrations(path, **options)

@@ -13,7 +13,7 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.data import LeRobotExperienceReplay
+from warmprior.data import LeRobotDemonstrations
 from warmprior.data.lerobot_index import action_names, state_names
 from warmprior.envs.tasks import TASKS
 
@@ -46,7 +46,7 @@ def test_windows_are_those_of_delta_timestamps(written):
         "observation.state": [i / 20 for i in range(1 - TO, 1)],
     }
     theirs = LeRobotDataset("local/test", root=root, delta_timestamps=deltas)
-    data = LeRobotExperienceReplay(root, observation_keys=["observation.state"]).data
+    data = LeRobotDemonstrations(root, observation_keys=["observation.state"]).data
     windows = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=TO)
     transform, prior = windows.transform, PastPrior(H)
     assert len(data) == len(theirs) == 16
@@ -68,7 +68,7 @@ def test_windows_are_those_of_delta_timestamps(written):
 def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
     root, values = written
     for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path}):
-        replay = LeRobotExperienceReplay(root, env_args=env_args_15("lift"), **options)
+        replay = LeRobotDemonstrations(root, env_args=env_args_15("lift"), **options)
         data = replay.data
         state = np.concatenate([values[f"observation.{n}state"] for n in ("environment_", "")], -1)
         np.testing.assert_array_equal(data["observation"].numpy(), state)
@@ -89,7 +89,7 @@ def test_images_are_decoded_as_lerobot_does(written):
 
     root, _ = written
     keys = ["agentview_image", "robot0_eye_in_hand_image"]
-    replay = LeRobotExperienceReplay(root, image_keys=keys, storage="memmap")
+    replay = LeRobotDemonstrations(root, image_keys=keys, storage="memmap")
     theirs = LeRobotDataset("local/test", root=root)
     observation = replay.data["observation"]
     assert replay.image_size == 32 and observation["state"].shape == (16, 19)
@@ -109,7 +109,7 @@ def test_rewards_are_those_of_the_dataset(tmp_path, kind):
     feature = numbers(1) if kind == "reward" else {"dtype": "bool", "shape": (1,), "names": None}
     features = {name: numbers(w) for name, w in WIDTHS.items()} | {f"next.{kind}": feature}
     values = write_lerobot(tmp_path / "data", features=features)[f"next.{kind}"]
-    data = LeRobotExperienceReplay(tmp_path / "data").data
+    data = LeRobotDemonstrations(tmp_path / "data").data
     np.testing.assert_array_equal(data["next", "reward"].numpy(), values.astype(np.float32))
     last = torch.tensor([5, 6, 15])
     won = torch.from_numpy(values > 0)[last]
@@ -131,7 +131,7 @@ def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
         names["observation.state"] = state_names(TASKS["lift"].low_dim_widths)
     features = {name: numbers(width, names.get(name)) for name, width in widths.items()}
     values = write_lerobot(tmp_path / "data", features=features)
-    replay = LeRobotExperienceReplay(tmp_path / "data", env_args=env_args_15("lift"))
+    replay = LeRobotDemonstrations(tmp_path / "data", env_args=env_args_15("lift"))
     expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
     np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
     assert replay.observation_keys == TASKS["lift"].low_dim_keys

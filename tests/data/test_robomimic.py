@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from warmprior.data import RobomimicExperienceReplay
+from warmprior.data import RobomimicDemonstrations
 from warmprior.envs import absolute_actions, modernize_env_args
 from warmprior.envs.tasks import TASKS
 
@@ -27,7 +27,7 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
     path = tmp_path / "file.hdf5"
     demos = write_robomimic_file(path, lengths=(12, 1, 30), task=task, failures=(2,))
     scratch = tmp_path / "scratch" if task == "lift" else None
-    replay = RobomimicExperienceReplay(path, storage=storage, scratch_dir=scratch)
+    replay = RobomimicDemonstrations(path, storage=storage, scratch_dir=scratch)
     data = replay.data
     assert data.batch_size == (43,) and len(replay) == 43
     expected = {
@@ -58,7 +58,7 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
 def test_data_is_the_storage(square_file, tmp_path):
     path, _ = square_file
     for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path / "maps"}):
-        replay = RobomimicExperienceReplay(path, batch_size=7, **options)
+        replay = RobomimicDemonstrations(path, batch_size=7, **options)
         assert replay.data["action"].data_ptr() == replay.data["action"].data_ptr()
         replay.data["action"].fill_(0.25)
         assert (replay.sample()["action"] == 0.25).all()
@@ -67,9 +67,9 @@ def test_data_is_the_storage(square_file, tmp_path):
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):
     path, _ = square_file
-    replay = RobomimicExperienceReplay(path, batch_size=47, sampler=SamplerWithoutReplacement(shuffle=True))
+    replay = RobomimicDemonstrations(path, batch_size=47, sampler=SamplerWithoutReplacement(shuffle=True))
     assert sorted(replay.sample()["frame"].tolist()) == list(range(47))
-    replay = RobomimicExperienceReplay(
+    replay = RobomimicDemonstrations(
         path,
         batch_size=20,
         sampler=SliceSampler(slice_len=5, end_key=("next", "done")),
@@ -87,7 +87,7 @@ def test_absolute_actions(tmp_path, task, frame):
     path = tmp_path / "file.hdf5"
     meta = env_args_14(task) if frame == "old" else env_args_15(task, frame)
     demos = write_robomimic_file(path, task=task, env_args=meta)
-    replay = RobomimicExperienceReplay(path, absolute_actions=True)
+    replay = RobomimicDemonstrations(path, absolute_actions=True)
     arms = TASKS[task].arms
     poses = [
         np.concatenate([demos[1][f"robot{a}_{key}"] for a in range(arms)], -1)
@@ -115,14 +115,14 @@ def test_peak_memory(tmp_path, options):
     code = f"""
         import re, sys
         from pathlib import Path
-        from warmprior.data import RobomimicExperienceReplay
+        from warmprior.data import RobomimicDemonstrations
         # What is imported or cached on first use is not the data's.
-        RobomimicExperienceReplay(sys.argv[1], {options})
+        RobomimicDemonstrations(sys.argv[1], {options})
         status = lambda key: 1024 * int(
             re.search(key + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]
         )
         before = status("VmRSS")
-        data = RobomimicExperienceReplay(sys.argv[2], {options}).data
+        data = RobomimicDemonstrations(sys.argv[2], {options}).data
         size = sum(v.numel() * v.element_size() for v in data.values(True, True))
         print((status("VmHWM") - before) / size, size)
     """
@@ -139,6 +139,6 @@ def test_peak_memory(tmp_path, options):
 
 def test_absolute_actions_of_long_demos_are_made_in_blocks(square_file, monkeypatch):
     path, _ = square_file
-    whole = RobomimicExperienceReplay(path, absolute_actions=True).data
+    whole = RobomimicDemonstrations(path, absolute_actions=True).data
     monkeypatch.setattr("warmprior.data.replay.BLOCK", 7)
-    assert (RobomimicExperienceReplay(path, absolute_actions=True).data == whole).all()
+    assert (RobomimicDemonstrations(path, absolute_actions=True).data == whole).all()

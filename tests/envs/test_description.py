@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
-from warmprior.data import RobomimicExperienceReplay
+from warmprior.data import RobomimicDemonstrations
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
 from warmprior.envs.description import environment_name, robosuite_parts
 from warmprior.envs.simulator import task_env_args
@@ -68,7 +68,7 @@ def solved(path, actions):
     """Which recorded demonstrations solve the task again, from the start that their seed gives."""
     import h5py
 
-    data = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
+    data = RobomimicDemonstrations(path, absolute_actions=actions == "absolute")
     make_env, adapters = robosuite_parts(environment_description(data.env_args, "ph", 2, actions))
     env = TransformedEnv(make_env(), Compose(*adapters.values()))
     outcomes = []

@@ -24,7 +24,7 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.data import RobomimicExperienceReplay
+from warmprior.data import RobomimicDemonstrations
 from warmprior.envs import modernize_env_args
 from warmprior.training.checkpoint import load_state, module_tensors, named, snapshot_optimizer
 from warmprior.training.saved import load_policy, policy_config, save_policy
@@ -237,10 +237,10 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
     options = {"filter_key": "train" if masked else None, "absolute_actions": bool(rng.random() < 0.3)}
 
     def load() -> Outcome:
-        replay = RobomimicExperienceReplay(path, **options)
+        replay = RobomimicDemonstrations(path, **options)
         if must_refuse:
             return Outcome("silent", "was read")
-        expected = RobomimicExperienceReplay(whole, **options)
+        expected = RobomimicDemonstrations(whole, **options)
         same = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
         if same and replay.env_args == expected.env_args:
             return Outcome("equal")
@@ -250,7 +250,7 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
     return how, load, str(path)
 
 
-def _says_so(path: Path, replay: RobomimicExperienceReplay, options: dict) -> bool:
+def _says_so(path: Path, replay: RobomimicDemonstrations, options: dict) -> bool:
     """Whether h5py alone reads the same."""
     with h5py.File(path) as file:
         demos = sorted(file["data"], key=lambda name: int(name[5:]))

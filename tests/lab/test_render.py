@@ -21,7 +21,7 @@ from lab import render as render_module
 from lab.render import render_demonstrations
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.data import DatasetError, RobomimicExperienceReplay
+from warmprior.data import DatasetError, RobomimicDemonstrations
 from warmprior.data.opening import Demonstrations
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
@@ -210,16 +210,16 @@ def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
     [
         (lambda images: images / 255, r"type float64; images are uint8"),
         (lambda images: images[..., :2], r"\(4, 16, 16, 2\).*images are uint8"),
-        (lambda images: images[:3], "but actions has 4 rows"),
-        (lambda images: images[:, :8], "only square images"),
-        (lambda images: images[:, :8, :8], "obs/agentview_image, 16 .*several sizes"),
-        (None, "no images 'agentview_image'; it has robot0_eye_in_hand_image"),
+        (lambda images: images[:3], r"\(3, 16, 16, 3\).*\(4, side"),
+        (lambda images: images[:, :8], r"\(4, 8, 16, 3\).*side, side"),
+        (lambda images: images[:, :8, :8], "obs/agentview_image.* 16: .*render them again"),
+        (None, "no images 'agentview_image'; .*robot0_eye_in_hand_image"),
     ],
 )
 def test_images_of_another_kind_are_refused(picture, value, said):
     replaced(picture, value)
     with pytest.raises(DatasetError, match=rf"data/demo_1.*{said}"):
-        RobomimicExperienceReplay(picture, image_keys=IMAGES)
+        RobomimicDemonstrations(picture, image_keys=IMAGES)
 
 
 @pytest.mark.slow
@@ -245,7 +245,7 @@ def test_images_upside_down_are_refused(picture):
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
-    dataset = RobomimicExperienceReplay(
+    dataset = RobomimicDemonstrations(
         rendered,
         observation_keys=["robot0_eef_pos"],
         image_keys=IMAGES,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
+from warmprior.data.lerobot import LeRobotDemonstrations, lerobot_steps
 from warmprior.data.replay import DatasetError
-from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.data.robomimic import RobomimicDemonstrations
 
 __all__ = [
     "DatasetError",
-    "LeRobotExperienceReplay",
-    "RobomimicExperienceReplay",
+    "LeRobotDemonstrations",
+    "RobomimicDemonstrations",
     "convert_robomimic",
     "lerobot_steps",
 ]

@@ -18,10 +18,11 @@ from tqdm import tqdm
 from warmprior.data.hdf5 import read_index, read_masks, read_origin
 from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.replay import DatasetError, DatasetIndex
-from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE
+from warmprior.modules.checks import check_choice
 
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
@@ -66,26 +67,21 @@ def convert_robomimic(
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     path, folder = Path(path), Path(folder).expanduser()
-    if images not in (None, *KINDS):
-        raise ValueError(f"images must be one of {', '.join(KINDS)} or None, got {images!r}")
     index = read_index(path, demos=demos)
-    if images:
+    if images is not None:
+        check_choice("images", images, KINDS)
         keys = [f"{camera}_image" for camera in index.cameras]
         if not keys:
-            raise DatasetError(f"{path} has no images: render them first, or leave images out")
+            raise DatasetError(f"{path} has no images: render them first, or take images=None")
         index = read_index(path, demos=demos, image_keys=keys)
-        if images == "video" and index.image_size < VIDEO_SIZE:
-            raise ValueError(
-                f"{path}: images of {index.image_size} pixels are too small for a video, which takes "
-                f"{VIDEO_SIZE}: write pictures (images='image'), or render larger ones"
-            )
+        side = index.image_size
+        if images == "video" and side < VIDEO_SIZE:
+            raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; take images='image'")
     if os.path.lexists(folder):
-        raise FileExistsError(f"{folder} exists: choose another folder, or remove it to convert anew")
+        raise FileExistsError(f"{folder} exists: choose another folder, or remove it")
     fps = index.env_args["env_kwargs"].get("control_freq", 20)
     if fps != int(fps):
-        raise DatasetError(
-            f"{path}: control_freq is {fps}, and LeRobot has whole numbers of steps per second"
-        )
+        raise DatasetError(f"{path}: control_freq is {fps}, and LeRobot needs a whole number")
     datasets = require("lerobot.datasets", "lerobot")
     check_writable(folder.parent)
     parts = folder.with_name(f".{folder.name}.converting")
@@ -132,7 +128,7 @@ def _write(
 ) -> None:
     layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
     task = index.env_args["env_name"].lower() if index.task is None else index.task.name
-    data = RobomimicExperienceReplay(
+    data = RobomimicDemonstrations(
         index.path,
         demos=len(index.demos),
         image_keys=index.image_keys,
@@ -197,9 +193,9 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Without the bars and banners of LeRobot's libraries, and without the priority of its AV1 encoder.
+    """Hide the bars and banners of LeRobot's libraries, and undo the priority of its AV1 encoder.
 
-    That gives a superuser's process real-time priority, beside which everything else stands still.
+    As root it would run at real-time priority and starve all other processes.
     """
     utils = require("lerobot.utils.utils", "lerobot")
     linux = hasattr(os, "sched_setscheduler")

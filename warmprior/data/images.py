@@ -47,10 +47,8 @@ class StateRenderer:
                 model = env.sim.model._model
                 placed.append(np.concatenate([model.body_pos, model.body_quat], -1))
         if not np.array_equal(*placed):
-            raise DatasetError(
-                f"{self.index.path}: {self.index.env_args['env_name']} moves fixtures at every reset, and "
-                "states do not tell where to: its images cannot be rendered from them"
-            )
+            path, name = self.index.path, self.index.env_args["env_name"]
+            raise DatasetError(f"{path}: {name} moves fixtures at resets: images do not follow from states")
         return CameraRenderer(model, self.size, self.size, fast=self.fast)
 
     def joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:
@@ -58,16 +56,11 @@ class StateRenderer:
         model = self.renderer.model
         expected = (steps, 1 + model.nq + model.nv)
         if states.shape != expected:
-            raise DatasetError(
-                f"{what} has shape {states.shape}, but the simulator of "
-                f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
-            )
+            name = self.index.env_args["env_name"]
+            raise DatasetError(f"{what} has shape {states.shape}, and the simulator of {name} has {expected}")
         usable = np.isfinite(states).all(-1)
         if not usable.all():  # MuJoCo would show something all the same
-            raise DatasetError(
-                f"{what} has NaN or infinity in row {int(np.argmin(usable))}: record it again, or leave the "
-                "demo out"
-            )
+            raise DatasetError(f"{what} has NaN or infinity in row {np.argmin(usable)}: leave the demo out")
         return states[:, 1 : 1 + model.nq]
 
     def compare(self, state: Sequence[float], images: Mapping[str, np.ndarray], advice: str) -> None:
@@ -89,33 +82,30 @@ class StateRenderer:
             if other or as_stored > CLEARLY:
                 view = view if other else next(iter(views))
                 raise DatasetError(
-                    f"{name}: the images of {camera} {view} ({as_stored:.0f} of 255 off on average). "
-                    f"Policies would see other ones in evaluation: {advice}"
+                    f"{name}: images of {camera} {view} ({as_stored:.0f} of 255 off): {advice}"
                 )
 
 
-def check_images(found: Demonstrations, cameras: Sequence[str], fast: bool) -> None:
+def check_images(demonstrations: Demonstrations, cameras: Sequence[str], fast: bool) -> None:
     """Compare the first images of some cameras with what the simulator shows there.
 
     A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
     """
     keys = [f"{camera}_image" for camera in cameras]
-    index = found.index(image_keys=keys, demos=1)
+    index = demonstrations.index(image_keys=keys, demos=1)
     if isinstance(index, LeRobotIndex):
         rendering, state = (index.described.get(name) for name in ("rendering", "first_state"))
     else:
         rendering, state = read_origin(index.path, index.demos[0])
     if rendering is not None and bool(rendering["fast"]) != fast:
-        raise DatasetError(
-            f"{index.path}: its images were rendered {'in full quality' if fast else 'fast'}, and in "
-            f"evaluation they would not be: take fast_rendering={not fast}"
-        )
+        how = "in full quality" if fast else "fast"
+        raise DatasetError(f"{index.path}: its images were rendered {how}: take fast_rendering={not fast}")
     if state is None:
         warnings.warn(
             f"{index.path} holds no states: its images could not be compared with the simulator's",
             stacklevel=2,
         )
         return
-    first = found.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
+    first = demonstrations.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
     images = {camera: first[f"{camera}_image"].permute(1, 2, 0).numpy() for camera in cameras}
     StateRenderer(index, index.image_size, fast).compare(state, images, "render these anew")

@@ -17,6 +17,7 @@ from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_
 from warmprior.data.replay import DatasetError, DemonstrationReader, DemonstrationReplay, store_finite
 from warmprior.io.extras import require
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
+from warmprior.modules.checks import check_shape
 
 DECODED = 2**26  # bytes of frames unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
@@ -32,8 +33,8 @@ def _reading(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # pyarrow's own, OSError, KeyError for its columns...
         raise DatasetError(
-            f"{path}: damaged, or not of this dataset ({error}). Copy or download it again, or record or "
-            "convert the dataset anew; a recording has to end with LeRobotDataset.finalize()."
+            f"{path}: damaged, or not of this dataset ({error}). Copy, download, record or convert it again; "
+            "recordings end with LeRobotDataset.finalize()."
         ) from error
 
 
@@ -108,13 +109,9 @@ class LeRobotReader(DemonstrationReader):
             frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
             for first in range(0, len(out), step):
                 part = out[first : first + step]
-                found = frames(first, first + len(part))
-                if found.shape != part.shape:
-                    raise ValueError(
-                        f"{feature} of episode {demo} has frames of shape {tuple(found.shape[1:])}, but "
-                        f"meta/info.json says {tuple(part.shape[1:])}"
-                    )
-                part.copy_(found)
+                decoded = frames(first, first + len(part))
+                check_shape(f"{feature} of episode {demo}", decoded, part.shape)
+                part.copy_(decoded)
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
         decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
@@ -125,8 +122,8 @@ class LeRobotReader(DemonstrationReader):
 
 def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
     image, parquet = require("PIL.Image", "lerobot"), require("pyarrow.parquet", "lerobot")
-    mine = [("episode_index", "==", episode["episode_index"])]
-    column = parquet.read_table(path, columns=[feature], filters=mine).column(feature)
+    rows = [("episode_index", "==", episode["episode_index"])]
+    column = parquet.read_table(path, columns=[feature], filters=rows).column(feature)
 
     def frames(first: int, stop: int) -> Tensor:
         # Their bytes alone: a path in them could lead anywhere.
@@ -137,10 +134,10 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
     return frames
 
 
-class LeRobotExperienceReplay(DemonstrationReplay):
+class LeRobotDemonstrations(DemonstrationReplay):
     """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
-    The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties.
+    The counterpart of :class:`RobomimicDemonstrations`, with the same entries and properties.
     :class:`~warmprior.ActionWindow` makes windows, whose history and padding are those of
     ``delta_timestamps``, but that what lies outside an episode is masked and zero where LeRobot repeats its
     first action, which is part of the target.
@@ -161,21 +158,21 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
             are many.
         filter_key: a mask of the converted file. It, ``demos``, ``absolute_actions`` and ``**kwargs`` are as
-            of :class:`RobomimicExperienceReplay`.
+            of :class:`RobomimicDemonstrations`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
         DatasetError: if the dataset is not as it should be, or does not fit the environment; says which
             folder or file, and why.
-        ValueError: see :class:`RobomimicExperienceReplay`.
+        ValueError: see :class:`RobomimicDemonstrations`.
         OSError: if a download fails, or there is no space for memory maps.
 
     Examples:
-        >>> from warmprior.data import LeRobotExperienceReplay
-        >>> data = LeRobotExperienceReplay("square_lerobot", batch_size=256)  # doctest: +SKIP
+        >>> from warmprior.data import LeRobotDemonstrations
+        >>> data = LeRobotDemonstrations("square_lerobot", batch_size=256)  # doctest: +SKIP
         >>> data.sample()["observation"].shape  # doctest: +SKIP
         torch.Size([256, 23])
-        >>> LeRobotExperienceReplay("square_lerobot")
+        >>> LeRobotDemonstrations("square_lerobot")
         Traceback (most recent call last):
             ...
         FileNotFoundError: square_lerobot: no meta/info.json there, so no LeRobotDataset; ...
@@ -234,5 +231,5 @@ def lerobot_steps(
         >>> steps["action"].shape  # doctest: +SKIP
         torch.Size([25650, 2])
     """
-    data = LeRobotExperienceReplay(dataset, observation_keys=observation_keys, demos=demos).data
+    data = LeRobotDemonstrations(dataset, observation_keys=observation_keys, demos=demos).data
     return data.select(OBSERVATION, ACTION, EPISODE)

@@ -9,7 +9,15 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.replay import DatasetError, DatasetIndex, check_count, check_env_args, check_filter_key
+from warmprior.data.replay import (
+    DatasetError,
+    DatasetIndex,
+    check_count,
+    check_env_args,
+    common_size,
+    pose_keys,
+    unknown,
+)
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
@@ -28,7 +36,7 @@ LEROBOT_VERSION = "v3.0"
 def download_lerobot(
     repository: str, files: Sequence[str] = ("meta/*",), *, revision: str | None = None
 ) -> Path:
-    """Fetch files of a LeRobotDataset, by their patterns, unless they are here already; the dataset's folder.
+    """Fetch files of a LeRobotDataset by their patterns, unless they are here; return the dataset's folder.
 
     ``$HF_LEROBOT_HOME/REPOSITORY`` comes first, as in LeRobot, then its cache, without a connection.
     """
@@ -38,7 +46,7 @@ def download_lerobot(
         return home / repository
     revision = LEROBOT_VERSION if revision is None else revision
     try:
-        found = require("huggingface_hub", "lerobot").snapshot_download(
+        folder = require("huggingface_hub", "lerobot").snapshot_download(
             repository,
             repo_type="dataset",
             revision=revision,
@@ -46,14 +54,11 @@ def download_lerobot(
             allow_patterns=list(files),
         )
     except Exception as error:  # the client's errors share no base class
-        reason = str(error).strip() or "no message"
         raise OSError(
-            f"could not download {repository} at {revision}: {type(error).__name__}: {reason}\n"
-            "Check the name and the connection. A dataset of an older version has no such revision: convert "
-            "it with python -m lerobot.scripts.convert_dataset_v21_to_v30. A folder fetched by other means "
-            "can be given by its path."
+            f"could not download {repository} at {revision} ({error!r}): check name and connection; older "
+            "datasets lack this revision until python -m lerobot.scripts.convert_dataset_v21_to_v30"
         ) from error
-    return Path(found)
+    return Path(folder)
 
 
 @dataclass(frozen=True)
@@ -111,37 +116,31 @@ def _metadata(root: Path) -> Any:
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
-    again = "Copy or download it again, or record or convert it anew"
+    again = "Copy, download, record or convert it again."
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
         if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
-            raise DatasetError(
-                f"{root} has no {pattern}: the dataset has no episodes, or its recording did not end with "
-                f"LeRobotDataset.finalize(). {again}."
-            )
+            raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
     try:
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
     except Exception as error:  # of json, pyarrow, datasets and LeRobot itself
-        raise DatasetError(
-            f"{root}: LeRobot cannot read the meta/ of this dataset ({error}). {again}."
-        ) from error
-    if not metadata.total_episodes:
-        raise DatasetError(f"{root}: the dataset has no episodes: record some")
+        raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
-    if numbers != list(range(metadata.total_episodes)) or steps != metadata.total_frames:
+    count, frames = metadata.total_episodes, metadata.total_frames
+    if not count or numbers != list(range(count)) or steps != frames:
         raise DatasetError(
-            f"{root}: meta/info.json counts {metadata.total_episodes} episodes of {metadata.total_frames} "
-            f"steps, and meta/episodes {len(numbers)} of {steps}. {again}."
+            f"{root}: meta/info.json counts {count} episodes of {frames} steps, and meta/episodes "
+            f"{len(numbers)} of {steps}. {again}"
         )
     return metadata
 
 
 def action_names(arms: int) -> list[str]:
-    """What the pose deltas of so many arms of robosuite are called in a dataset, such as ``robot0_rx``."""
+    """Return what a dataset calls the pose deltas of so many arms of robosuite, such as ``robot0_rx``."""
     return [f"robot{arm}_{name}" for arm in range(arms) for name in _ARM_ACTIONS]
 
 
 def state_names(widths: Mapping[str, int]) -> list[str]:
-    """What the numbers of observations of these widths are called in a dataset, in the same order."""
+    """Return what a dataset calls the numbers of observations of these widths, in the same order."""
     return [f"{key}_{i}" for key, width in widths.items() for i in range(width)]
 
 
@@ -168,7 +167,7 @@ def read_lerobot_index(
     """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
 
     Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read. Options and
-    errors are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
+    errors are those of :class:`~warmprior.data.LeRobotDemonstrations`; ``poses`` also requires the hand
     pose of every arm, from which absolute actions are built.
     """
     remote = is_remote(dataset)
@@ -176,11 +175,9 @@ def read_lerobot_index(
     metadata = _metadata(root)
     described = _description(root)
     recorded = described.get("env_args") or dict(env_args or {})
-    if env_args and recorded["env_name"] != env_args["env_name"]:
-        raise DatasetError(
-            f"{root}: the dataset was recorded in {recorded['env_name']}, not in {env_args['env_name']}: "
-            "leave the task (env_args) out or correct it"
-        )
+    name = recorded.get("env_name")
+    if env_args and name != env_args["env_name"]:
+        raise DatasetError(f"{root} was recorded in {name}, not in {env_args['env_name']}: correct env_args")
     task = task_of_env(recorded) if recorded else None
     widths = {
         name: feature["shape"][0]
@@ -188,7 +185,7 @@ def read_lerobot_index(
         if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
     }
     if "action" not in widths:
-        raise DatasetError(f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}")
+        raise unknown(root, "vector of numbers", "action", widths)
     if recorded:
         _check_actions(root, metadata, recorded, task)
     named = _named_columns(root, metadata.features, widths, described, task)
@@ -200,23 +197,11 @@ def read_lerobot_index(
             observation_keys = task.low_dim_keys
         elif not described:
             observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
-    arms = range(min(widths["action"] // 7, 2)) if poses else ()
-    for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
+    for key in [*observation_keys, *(pose_keys(widths["action"]) if poses else ())]:
         if key in metadata.camera_keys:
-            raise DatasetError(
-                f"{root}: {key!r} is no vector but an image: leave it out (LeRobotExperienceReplay reads "
-                "images by image_keys)"
-            )
+            raise DatasetError(f"{root}: {key!r} is an image, not a vector: name it in image_keys")
         if key not in columns:
-            raise DatasetError(
-                f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "
-                "observation_keys, or convert or record the dataset with it"
-            )
-    if not observation_keys:
-        raise DatasetError(
-            f"{root}: no observations are chosen; name some with observation_keys: "
-            f"{', '.join(columns) or 'there are none'}"
-        )
+            raise unknown(root, "observation", key, columns)
     cameras = {
         f"{name.rpartition('.')[2]}_image": name
         for name in metadata.camera_keys
@@ -225,7 +210,8 @@ def read_lerobot_index(
     episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     if filter_key is not None:
         masks = described.get("masks", {})
-        check_filter_key(root, filter_key, masks)
+        if filter_key not in masks:
+            raise unknown(root, "filter key", filter_key, masks)
         episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
     check_count(root, demos, len(episodes))
     episodes = episodes[:demos]
@@ -257,13 +243,15 @@ def _description(root: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        found = read_json(path)
+        description = read_json(path)
     except ValueError as error:
         raise DatasetError(f"{error}. Convert the file again.") from error
-    if not isinstance(found, dict) or found.get("format") != 1 or "observations" not in found:
+    if not (
+        isinstance(description, dict) and description.get("format") == 1 and "observations" in description
+    ):
         raise DatasetError(f"{path} is not of this version: convert the file again, or remove it")
-    check_env_args(f"{path}: env_args", found.get("env_args"))
-    return found
+    check_env_args(f"{path}: env_args", description.get("env_args"))
+    return description
 
 
 def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], what: str) -> None:
@@ -274,29 +262,22 @@ def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], wh
     # Seven numbers may be joints as well as a pose.
     if names and names != expected:
         raise DatasetError(
-            f"{root}: {what} {', '.join(expected)}, but here they are named {', '.join(map(str, names))}: "
-            "choose another task or dataset or, if these are only other names, set the feature's names in "
-            "meta/info.json to null"
+            f"{root}: {what} {', '.join(expected)}, and here {', '.join(map(str, names))}: choose another "
+            "task, or set names in meta/info.json to null if they mean the same"
         )
 
 
 def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None) -> None:
     """Whether the actions are those of an environment, one per control step."""
-    control = env_args["env_kwargs"].get("control_freq", 20)
+    name, control = env_args["env_name"], env_args["env_kwargs"].get("control_freq", 20)
     if metadata.fps != control:
-        raise DatasetError(
-            f"{root}: fps is {metadata.fps}, but {env_args['env_name']} is controlled at {control} Hz, and "
-            "one action per control step is needed: resample the dataset, or name another task"
-        )
+        raise DatasetError(f"{root}: fps is {metadata.fps}, but {name} runs at {control} Hz: resample it")
     if task is None:
         return
     action = metadata.features["action"]
-    if tuple(action["shape"]) != (task.action_dim,):
-        raise DatasetError(
-            f"{root}: 'action' has {action['shape'][0]} columns, but {task.env_name} takes "
-            f"{task.action_dim}: choose another task or dataset"
-        )
-    _check_names(root, action, action_names(task.arms), f"the actions of {task.env_name} are")
+    if (columns := action["shape"][0]) != task.action_dim:
+        raise DatasetError(f"{root}: 'action' has {columns} columns, but {name} takes {task.action_dim}")
+    _check_names(root, action, action_names(task.arms), f"the actions of {name} are")
 
 
 def _named_columns(
@@ -307,17 +288,15 @@ def _named_columns(
     task: TaskSpec | None,
 ) -> dict[str, tuple[str, slice]]:
     """Where robomimic's observations are."""
-    theirs = {name: width for name, width in widths.items() if name.startswith("observation.")}
+    vectors = {name: width for name, width in widths.items() if name.startswith("observation.")}
     if described:
         found = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
         needed = {} if task is None else task.low_dim_widths
         for key, (name, part) in found.items():
             width = needed.get(key, part.stop - part.start)
-            if not 0 <= part.start < part.stop == part.start + width <= theirs.get(name, 0):
-                raise DatasetError(
-                    f"{root / DESCRIPTION}: observations[{key!r}] are columns {part.start} to {part.stop} of "
-                    f"{name}, which do not fit the dataset or its task: convert the file again"
-                )
+            if not 0 <= part.start < part.stop == part.start + width <= vectors.get(name, 0):
+                what = f"observations[{key!r}], columns {part.start} to {part.stop} of {name},"
+                raise DatasetError(f"{root / DESCRIPTION}: {what} do not fit: convert the file again")
         return found
     if task is None:
         return {}
@@ -327,12 +306,12 @@ def _named_columns(
         {ROBOT_STATE: task.low_dim_widths},
     ]
     sums = [{name: sum(parts.values()) for name, parts in layout.items()} for layout in layouts]
-    fits = [total.items() <= theirs.items() for total in sums]
+    fits = [total.items() <= vectors.items() for total in sums]
     # Robots alone may be as wide as the whole state of another task.
-    fits[2] = fits[2] and ENVIRONMENT_STATE not in theirs
+    fits[2] = fits[2] and ENVIRONMENT_STATE not in vectors
     if not any(fits):
         raise DatasetError(
-            f"{root}: the observations are {theirs}, but those of {task.env_name} are "
+            f"{root}: the observations are {vectors}, and those of {task.env_name} "
             f"{' or '.join(map(str, reversed(sums)))}: choose another task or dataset"
         )
     layout = layouts[fits.index(True)]
@@ -350,21 +329,13 @@ def _image_size(
     root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], keys: Sequence[str]
 ) -> int:
     """The side of the images to read, in pixels; 0 if there are none."""
-    sizes = set()
+    sizes = {}
     for key in keys:
         if key not in cameras:
-            known = ", ".join(f"{k} ({name})" for k, name in cameras.items()) or "none"
-            raise DatasetError(
-                f"{root}: there are no images {key!r}; there are {known}. Choose other cameras, or render "
-                "them into a robomimic file, and convert that with its images"
-            )
+            raise unknown(root, "images", key, cameras)
         shape = tuple(features[cameras[key]]["shape"])
         side = max(shape)
         if shape not in ((side, side, 3), (3, side, side)):
-            raise DatasetError(
-                f"{root}: {cameras[key]!r} has shape {shape}; only square images of three colours can be used"
-            )
-        sizes.add(side)
-    if len(sizes) > 1:
-        raise DatasetError(f"{root}: the images have several sizes, {sizes}: choose those of one size")
-    return next(iter(sizes), 0)
+            raise DatasetError(f"{root}: {cameras[key]!r} has shape {shape}; only square images can be used")
+        sizes[side] = cameras[key]
+    return common_size(root, sizes)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5 import read_index
-from warmprior.data.lerobot import LeRobotExperienceReplay
+from warmprior.data.lerobot import LeRobotDemonstrations
 from warmprior.data.lerobot_index import read_lerobot_index
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
-from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.files import digest_of, file_digest
 
 LEROBOT = "lerobot:"
@@ -61,8 +61,8 @@ class Demonstrations:
         return read(self._path, **self._options, **options)
 
     def replay(self, **options: Any) -> DemonstrationReplay:
-        """Read them; options as of :class:`RobomimicExperienceReplay`."""
-        kind = LeRobotExperienceReplay if self._lerobot else RobomimicExperienceReplay
+        """Read them; options as of :class:`RobomimicDemonstrations`."""
+        kind = LeRobotDemonstrations if self._lerobot else RobomimicDemonstrations
         return kind(self._path, **self._options, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +23,7 @@ from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
+from warmprior.modules.checks import check_choice, check_whole_numbers
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -34,11 +35,11 @@ class DatasetError(ValueError):
     Examples:
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior.data import RobomimicExperienceReplay
+        >>> from warmprior.data import RobomimicDemonstrations
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "square.hdf5"
         ...     _ = path.write_bytes(b"a download that broke off")
-        ...     RobomimicExperienceReplay(path)
+        ...     RobomimicDemonstrations(path)
         Traceback (most recent call last):
             ...
         warmprior.data.replay.DatasetError: ...square.hdf5: not a readable HDF5 file (25 bytes; ...
@@ -71,9 +72,14 @@ class DatasetIndex:
     env_args: dict[str, Any]
     task: TaskSpec | None
 
+    def __post_init__(self) -> None:
+        if not self.observation_keys:
+            listed = ", ".join(self.available_keys)
+            raise DatasetError(f"{self.path}: no observations are chosen; name observation_keys: {listed}")
+
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras whose images there are."""
+        """Cameras that have images."""
         ending = "_image"
         return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
 
@@ -104,32 +110,38 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
 
 def check_count(path: Path, demos: int | None, available: int) -> None:
     """Refuse to take no demonstrations, or more than there are."""
-    if demos is not None and demos < 1:
-        raise ValueError(f"demos must be at least 1, got {demos}")
-    if demos is not None and demos > available:
-        raise DatasetError(
-            f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "
-            "for no more"
-        )
+    if demos is not None:
+        check_whole_numbers(demos=demos)
+        if demos > available:
+            raise DatasetError(f"{path}: there are {available} demonstrations, fewer than demos={demos}")
 
 
-def check_filter_key(path: Path, filter_key: str, known: Collection[str]) -> None:
-    """Refuse the name of a mask that there is not."""
-    if filter_key not in known:
-        names = f"choose one of {', '.join(known)}" if known else "this dataset has none"
-        raise DatasetError(f"{path}: unknown filter key {filter_key!r}; {names}")
+def unknown(where: Any, kind: str, name: str, known: Iterable[str]) -> DatasetError:
+    """Return the error that says which things of a kind there are, where one of another name is needed."""
+    return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(known) or 'none'}")
+
+
+def common_size(path: Path, sides: Mapping[int, str]) -> int:
+    """Return the side of all images in pixels, 0 if there are none, from one that has each side."""
+    if len(sides) > 1:
+        raise DatasetError(f"{path}: images must have one size, got {sides}: render them again")
+    return next(iter(sides), 0)
+
+
+def pose_keys(action_dim: int) -> list[str]:
+    """Return the observations of the hands' poses, of as many arms as the pose deltas are for."""
+    arms = range(min(action_dim // 7, 2))
+    return [f"robot{arm}_eef_{part}" for arm in arms for part in ("pos", "quat")]
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
     """Copy numbers to ``out``; a ``DatasetError`` if one is not finite there, or above 1e9."""
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)
-    usable = (np.abs(out) <= LARGEST).all(-1)  # NaN is not
+    usable = np.abs(out) <= LARGEST  # NaN is not
     if not usable.all():
-        worst = int(np.argmin(usable))
-        finite = np.isfinite(out[worst]).all()
-        found = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
-        raise DatasetError(f"{what} has {found} in row {first + worst}. {advice}")
+        value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
+        raise DatasetError(f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g}. {advice}")
 
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
@@ -158,9 +170,8 @@ def _allocate(
     available = available_memory()
     if storage == "memory" and needed > available:
         raise DatasetError(
-            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but "
-            f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer with demos "
-            "or filter_key"
+            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB "
+            "are free: use storage='memmap' or fewer demos"
         )
     if storage == "memory":
         return torch.empty_like(data)
@@ -171,7 +182,7 @@ def _allocate(
     except OSError as error:
         raise OSError(
             f"{scratch_dir or 'the folder of temporary files'}: cannot take {needed / 1e9:.3g} GB for "
-            f"{index.path} ({error}). Free some space or choose another scratch_dir."
+            f"{index.path} ({error}): free some space or choose another scratch_dir"
         ) from error
     return data
 
@@ -207,12 +218,8 @@ def _read_absolute(
             reader.numbers(demo, quaternion, turns, first)
             off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
             if off.max() > UNIT_TOLERANCE:
-                worst = int(off.argmax())
-                raise DatasetError(
-                    f"{reader.name(demo, quaternion)} is no rotation in row {first + worst}: "
-                    f"the quaternion {turns[worst].tolist()} does not have length 1. Rebuild or remove "
-                    "the demo, or leave it out."
-                )
+                what, row = reader.name(demo, quaternion), int(off.argmax())
+                raise DatasetError(f"{what} is no rotation in row {first + row}: its length is not 1")
         rows[...] = to_absolute(
             torch.from_numpy(deltas),
             torch.from_numpy(positions),
@@ -252,7 +259,7 @@ def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader
 
 
 class DemonstrationReplay(TensorDictReplayBuffer):
-    """What buffers of all formats share; entries and options as :class:`RobomimicExperienceReplay` tells."""
+    """What buffers of all formats share; entries and options as :class:`RobomimicDemonstrations` tells."""
 
     def __init__(
         self,
@@ -265,8 +272,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
-        if storage not in ("memory", "memmap"):
-            raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
+        check_choice("storage", storage, ("memory", "memmap"))
         device = torch.device(device)
         if storage == "memmap" and device.type != "cpu":
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
@@ -276,16 +282,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
                 modernize_env_args(index.env_args)
                 arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
             except Exception as error:  # whatever their unexpected structure leads to
-                reason = str(error) if isinstance(error, ValueError) else repr(error)
-                raise DatasetError(
-                    f"{index.path}: env_args describes no environment as these actions need it: {reason}"
-                ) from error
+                raise DatasetError(f"{index.path}: env_args do not suit these actions: {error!r}") from error
         if absolute_actions:
             if action_dim != 7 * arms:
-                raise DatasetError(
-                    f"{index.path}: actions have {action_dim} columns, but env_args names {arms} robot(s) "
-                    f"with 7 each; absolute actions cannot be built"
-                )
+                raise DatasetError(f"{index.path}: actions have {action_dim} columns, not {7 * arms}")
             action_dim = 10 * arms
         data = _allocate(index, action_dim, storage, scratch_dir)
         _fill(index, data, reader, absolute_actions)

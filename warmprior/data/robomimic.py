@@ -10,7 +10,7 @@ from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
 from warmprior.data.replay import DemonstrationReplay
 
 
-class RobomimicExperienceReplay(DemonstrationReplay):
+class RobomimicDemonstrations(DemonstrationReplay):
     """Demonstrations of an HDF5 file of robomimic or MimicGen, as one immutable TorchRL replay buffer.
 
     The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
@@ -48,11 +48,11 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         OSError: if there is no space for memory maps.
 
     Examples:
-        >>> from warmprior.data import RobomimicExperienceReplay
-        >>> data = RobomimicExperienceReplay("square.hdf5", batch_size=256)  # doctest: +SKIP
+        >>> from warmprior.data import RobomimicDemonstrations
+        >>> data = RobomimicDemonstrations("square.hdf5", batch_size=256)  # doctest: +SKIP
         >>> data.sample()["observation"].shape  # doctest: +SKIP
         torch.Size([256, 23])
-        >>> RobomimicExperienceReplay("nowhere.hdf5")
+        >>> RobomimicDemonstrations("nowhere.hdf5")
         Traceback (most recent call last):
             ...
         FileNotFoundError: nowhere.hdf5: no such file; check the path

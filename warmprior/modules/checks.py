@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
@@ -24,11 +24,11 @@ def check_finite_numbers(**values: Any) -> None:
             raise ValueError(f"{name} must be a finite number, got {value!r}")
 
 
-def check_whole_numbers(**values: Any) -> None:
-    """Raise ValueError for the first of them that is no whole number of at least 1."""
+def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
+    """Raise ValueError for the first of them that is no whole number of at least ``least``."""
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
 def check_positive(**values: float) -> None:
@@ -36,6 +36,25 @@ def check_positive(**values: float) -> None:
     for name, value in values.items():
         if not (value > 0 and math.isfinite(value)):
             raise ValueError(f"{name} must be a finite number > 0, got {value}")
+
+
+def check_between(low: float, high: float, /, **values: float) -> None:
+    """Raise ValueError for the first of them that is not in the interval, ends included."""
+    for name, value in values.items():
+        if not low <= value <= high:
+            raise ValueError(f"{name} must be between {low} and {high}, got {value}")
+
+
+def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
+    """Raise ValueError if a value is none of the choices."""
+    if value not in (listed := list(choices)):
+        raise ValueError(f"{name} must be one of {', '.join(listed)}, got {value!r}")
+
+
+def check_shape(name: str, value: Any, expected: Sequence[int]) -> None:
+    """Raise ValueError if a tensor or array has another shape."""
+    if tuple(value.shape) != tuple(expected):
+        raise ValueError(f"{name} has shape {list(value.shape)}, expected {list(expected)}")
 
 
 def check_keys(tensordict: TensorDictBase, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
