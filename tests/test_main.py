@@ -172,4 +172,4 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     actor = load_policy(capsys.readouterr().out.strip())
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
-    assert "there are 2 demonstrations, fewer than the 3" in capsys.readouterr().err
+    assert "2 demonstrations, fewer than demos=3" in capsys.readouterr().err

@@ -108,7 +108,7 @@ def test_state_round_trip(lift_env):
     np.testing.assert_array_equal(loop.state(), state)
     for key, value in before.items():
         np.testing.assert_allclose(after[key], value, atol=1e-9, err_msg=key)
-    with pytest.raises(ValueError, match=r"expected a state of shape \[32\], got \[3\]"):
+    with pytest.raises(ValueError, match=r"state has shape \[3\], expected \[32\]"):
         loop.set_state(np.zeros(3))
 
 

@@ -81,7 +81,7 @@ def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
     """Instead of waiting for OpenGL's threads, which are not there, for ever."""
     lift.render_frame()
     for size in (SIZE, 16):  # with the renderer that is there, and with a new one
-        with pytest.raises(RuntimeError, match="forked from one that had rendered"):
+        with pytest.raises(RuntimeError, match="fork of a process that rendered"):
             apart(partial(lift.render_frame, size=size))()
     # What is forked but does not render is none of its business.
     assert apart(partial(sum, [1, 2]))() == 3

@@ -77,7 +77,7 @@ def test_a_function_of_ones_own_is_found_by_its_place(monkeypatch):
         ("a_users_module:number", "returns int, not a Task"),
         ("a_users_module:nothing", "a_users_module:nothing: module .* has no attribute"),
         ("no_such_module:task", "No module named 'no_such_module'"),
-        ("nothing", "unknown task 'nothing'"),
+        ("nothing", "task must be one of .*'nothing'"),
     ):
         with pytest.raises(ValueError, match=said):
             load_task(options, name)
@@ -123,7 +123,7 @@ def test_part_of_a_file_is_its_first_demonstrations(path):
     assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
     mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
     assert torch.allclose(mine, theirs[:30], atol=1e-6)
-    with pytest.raises(DatasetError, match="there are 2 demonstrations, fewer than the 3"):
+    with pytest.raises(DatasetError, match=r"2 demonstrations.*demos=3"):
         Task.from_file(path, demos=3)
 
 

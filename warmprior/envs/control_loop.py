@@ -16,6 +16,7 @@ import numpy as np
 from warmprior.envs.simulator import isolated_numpy_seed
 from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
+from warmprior.modules.checks import check_choice, check_shape
 
 
 class Arm:
@@ -101,10 +102,9 @@ def check_supported(env: Any) -> None:
             and controller.interpolator_ori is None
         )
         if not supported:
+            what = f"{type(composite).__name__} with {sorted(parts)}"
             raise ValueError(
-                "the lean control loop supports one-handed arms with a fixed-impedance, uncoupled "
-                "OSC_POSE controller without interpolation; use control_loop='robosuite' for "
-                f"{type(composite).__name__} with {sorted(parts)}"
+                f"the lean loop has only plain OSC_POSE arms: control_loop='robosuite' for {what}"
             )
 
 
@@ -184,12 +184,8 @@ class StepLoop:
             if name == "object-state" or observables.get(name) is not None
         }
         if keys is not None:
-            missing = sorted(set(keys) - set(self._names.values()))
-            if missing:
-                raise ValueError(
-                    f"the environment has no observation {', '.join(missing)}; it has "
-                    f"{', '.join(sorted({'object', *observables}))}"
-                )
+            for key in set(keys) - set(self._names.values()):
+                check_choice("observation", key, sorted({"object", *observables} - {key}))
             self._names = {name: key for name, key in self._names.items() if key in keys}
 
     def _bind(self) -> None:
@@ -212,11 +208,7 @@ class StepLoop:
         The gripper's command and the solver's starting point are not part of it, so the continuation is close
         to the recorded one but not identical.
         """
-        if np.shape(state) != (1 + self._model.nq + self._model.nv,):
-            raise ValueError(
-                f"expected a state of shape [{1 + self._model.nq + self._model.nv}], got "
-                f"{list(np.shape(state))}"
-            )
+        check_shape("state", state, (1 + self._model.nq + self._model.nv,))
         self.env.sim.set_state_from_flattened(state)
         self.env.sim.forward()
         return self._settled_observations()
@@ -233,8 +225,8 @@ class StepLoop:
 
     def observations(self, refresh: bool = True) -> Observations:
         """The observations, float64 under robomimic's names; of the last step unless ``refresh``."""
-        found = self.env._get_observations(force_update=refresh)
-        return {key: np.atleast_1d(found[name]) for name, key in self._names.items()}
+        observations = self.env._get_observations(force_update=refresh)
+        return {key: np.atleast_1d(observations[name]) for name, key in self._names.items()}
 
     def state(self) -> np.ndarray:
         """Return the simulator's state: time, positions and velocities, ``[1 + nq + nv]``."""
@@ -286,8 +278,7 @@ class ControlLoop(StepLoop):
     def advance(self, action: np.ndarray) -> bool:
         """Advance one control step without observing; whether the task is solved."""
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
-        if len(action) != env.action_dim:
-            raise ValueError(f"expected an action of width {env.action_dim}, got {len(action)}")
+        check_shape("action", action, (env.action_dim,))
         for substep in range(self._substeps):
             mujoco.mj_step1(model, data)
             mujoco.mj_fullM(model, self._mass, data.qM)
@@ -329,8 +320,8 @@ class ControlLoop(StepLoop):
         Only for observations that are poses: others are gone. The first one's may be wrong: sensors of
         objects relative to the gripper read poses that were cached a step before.
         """
-        data, found = self._data, []
+        data, observations = self._data, []
         for state in states:
             data.qpos[:], data.qvel[:] = np.split(state[1:], [self._model.nq])
-            found.append(self._observations_here())
-        return found
+            observations.append(self._observations_here())
+        return observations

@@ -117,10 +117,8 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     config = kwargs.get("controller_configs") or {"body_parts": {"right": {"type": "OSC_POSE"}}}
     part = (config[0] if isinstance(config, list) else config)["body_parts"]["right"]
     if part.get("type") != "OSC_POSE" or part.get("input_type", "delta") != "delta":
-        raise ValueError(
-            f"expected OSC_POSE deltas, env_args has {part.get('type')} with input_type "
-            f"{part.get('input_type')!r}; read these actions as they are (absolute_actions=False)"
-        )
+        kind = f"{part.get('type')} with input_type={part.get('input_type')!r}"
+        raise ValueError(f"expected OSC_POSE deltas, got {kind}; read the actions as they are")
     output_max = torch.as_tensor(part.get("output_max", _OUTPUT_MAX), dtype=torch.float64).expand(6)
     output_min = torch.as_tensor(part.get("output_min", -output_max), dtype=torch.float64).expand(6)
     limits = (part.get("input_min", -1), part.get("input_max", 1))
@@ -137,10 +135,9 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
 
 
 def _per_arm(name: str, value: Tensor, width: int, arms: int | None = None) -> Tensor:
-    if value.ndim == 0 or value.shape[-1] not in (width, 2 * width):
-        raise ValueError(f"{name} must have {width} or {2 * width} columns, got {list(value.shape)}")
-    if arms is not None and value.shape[-1] != arms * width:
-        raise ValueError(f"{name} has {value.shape[-1]} columns; {arms} arm(s) need {arms * width}")
+    widths = [n * width for n in ((1, 2) if arms is None else (arms,))]
+    if value.ndim == 0 or value.shape[-1] not in widths:
+        raise ValueError(f"{name} must have {' or '.join(map(str, widths))} columns, got {list(value.shape)}")
     return value.double().unflatten(-1, (-1, width))
 
 

@@ -71,10 +71,10 @@ def gym_env(
         (torch.Size([3]), False)
     """
     base = _Gym(env, categorical_action_encoding=True)
-    known = [key for key in base.observation_spec.keys(True, True) if isinstance(key, str)]
-    chosen = list(observation_keys) or known
-    if missing := [key for key in chosen if key not in known]:
-        raise KeyError(f"the environment has no observations {missing}: it has {known}")
+    present = [key for key in base.observation_spec.keys(True, True) if isinstance(key, str)]
+    chosen = list(observation_keys) or present
+    if missing := [key for key in chosen if key not in present]:
+        raise KeyError(f"the environment has no observations {missing}: it has {present}")
     dtypes = {success: torch.bool} if success is not None else {}
     dtypes |= dict.fromkeys(measures, torch.float32)
     if dtypes:

@@ -31,14 +31,11 @@ def find_mimicgen() -> Path:
             return folder
     # A bare folder of the name, such as the clone beside which Python runs, is no package.
     if spec is None or spec.origin is None:
-        raise ImportError(
-            "MimicGen's tasks need NVlabs' package, which is not on the package index (what has its "
-            f"name there is another project); run: {_INSTALL}"
-        )
+        raise ImportError(f"MimicGen's tasks need NVlabs' package, not the package index's; run: {_INSTALL}")
+    where = ", ".join(map(str, folders)) or spec.origin
     raise ImportError(
-        f"the package mimicgen in {', '.join(map(str, folders)) or spec.origin} is not NVlabs': it has no "
-        "envs/robosuite with stack, coffee and threading, and was not imported. The package index has "
-        f"another project of that name: pip uninstall mimicgen, then run: {_INSTALL}"
+        f"the package mimicgen in {where} is not NVlabs': it has no envs/robosuite/{{{','.join(_TASKS)}}}.py "
+        f"and was not imported; pip uninstall mimicgen, then run: {_INSTALL}"
     )
 
 

@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from warmprior import keys
+from warmprior.modules.checks import check_between, check_shape, check_whole_numbers
 
 STEPS = 64
 OBSTACLES = (-0.45, 0.45)
@@ -58,11 +59,6 @@ def _middles() -> list[int]:
     return [int((navigation_positions() - c).abs().argmin()) for c in OBSTACLES]
 
 
-def _check_octaves(octaves: int) -> None:
-    if isinstance(octaves, bool) or not isinstance(octaves, int) or octaves < 0:
-        raise ValueError(f"octaves must be a whole number of at least 0, got {octaves!r}")
-
-
 def _features(x: Tensor, octaves: int) -> Tensor:
     angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, octaves - 1, device=x.device)
     return torch.cat([x.unsqueeze(-1), angle.sin(), angle.cos()], dim=-1)
@@ -79,7 +75,7 @@ def navigation_demonstrations(octaves: int = OCTAVES) -> TensorDict:
         >>> navigation_demonstrations()["observation"].shape
         torch.Size([384, 9])
     """
-    _check_octaves(octaves)
+    check_whole_numbers(0, octaves=octaves)
     heights = navigation_heights()
     count = len(heights)
     return TensorDict(
@@ -163,7 +159,7 @@ class NavigationEnv(EnvBase):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
-        _check_octaves(octaves)
+        check_whole_numbers(0, octaves=octaves)
         self.octaves = octaves
         if route is not None and (len(route) != len(OBSTACLES) or any(side not in (1, -1) for side in route)):
             raise ValueError(f"a route is {len(OBSTACLES)} numbers 1 or -1, got {tuple(route)}")
@@ -214,8 +210,8 @@ class NavigationEnv(EnvBase):
                 failed = failed | (step == middle) & (height * side <= 0)
             done = done | failed
         success = done & ~failed
-        seen = self._tell(step + 1, height.clone(), collided, success, done)
-        return seen.set("reward", success.to(height.dtype))
+        result = self._tell(step + 1, height.clone(), collided, success, done)
+        return result.set("reward", success.to(height.dtype))
 
     def _tell(
         self, step: Tensor, height: Tensor, collided: Tensor, success: Tensor, done: Tensor
@@ -282,18 +278,16 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
         >>> metrics.switch_rate, metrics.collision_rate, metrics.route_entropy, metrics.distance
         (0.0, 0.0, 1.0, 0.0)
     """
-    if heights.ndim != 2 or heights.shape[1] != STEPS or not len(heights):
-        raise ValueError(f"heights must be [n, {STEPS}] with n > 0, got {tuple(heights.shape)}")
+    check_shape("heights", heights, (max(1, heights.numel() // STEPS), STEPS))
     if not torch.isfinite(heights).all():
         raise ValueError("the heights hold NaN or Inf")
-    if not 1 <= chunk_length < STEPS:
-        raise ValueError(f"chunk_length must be between 1 and {STEPS - 1}, got {chunk_length}")
+    check_between(1, STEPS - 1, chunk_length=chunk_length)
     x, demonstrations = navigation_positions().to(heights.device), navigation_heights()
     side = torch.where(heights.abs() > UNDECIDED, heights.sign(), 0.0)
     changes = side[:, 1:] * side[:, :-1] < 0
-    known = side[:, 1:] * side[:, :-1] != 0
+    decided = side[:, 1:] * side[:, :-1] != 0
     boundary = torch.arange(chunk_length - 1, STEPS - 1, chunk_length)
-    at_boundary = known[:, boundary]
+    at_boundary = decided[:, boundary]
     above = (heights[:, _middles()] > 0).long()
     routes = torch.bincount(2 * above[:, 0] + above[:, 1], minlength=4).double() / len(heights)
     taken = routes[routes > 0]

@@ -19,6 +19,7 @@ import numpy as np
 
 from warmprior.io.extras import require
 from warmprior.io.workers import stop_forking
+from warmprior.modules.checks import check_choice
 
 # EGL first: it uses a GPU where there is one. Both render the same pixels in software.
 _BACKENDS = ("egl", "osmesa")
@@ -46,8 +47,8 @@ def rendering_backend() -> str | None:
         >>> rendering_backend() in ("egl", "osmesa", None)  # doctest: +SKIP
         True
     """
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    for backend in sorted(_BACKENDS, key=lambda name: name != asked):
+    first = os.environ.get("MUJOCO_GL", "").lower()
+    for backend in sorted(_BACKENDS, key=lambda name: name != first):
         environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
         probe = subprocess.run(
             [sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False
@@ -63,8 +64,7 @@ def require_rendering() -> str:
     if backend is None:
         require("mujoco", "sim")  # without which no backend could be tried
         raise RuntimeError(
-            "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of "
-            "them: apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
+            "neither EGL nor OSMesa works here: apt-get install libegl1 libegl-mesa0 or libosmesa6"
         )
     return backend
 
@@ -101,9 +101,7 @@ class CameraRenderer:
         try:
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except mujoco.FatalError as error:
-            raise ValueError(
-                f"OpenGL cannot render images of {width} x {height} pixels here: {error}"
-            ) from error
+            raise ValueError(f"OpenGL cannot render {width} x {height} pixels here: {error}") from error
         finally:
             sizes.offwidth, sizes.offheight, quality.offsamples = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -131,8 +129,7 @@ class CameraRenderer:
         mujoco, model, data = self._mujoco, self.model, self._data
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         if number < 0:
-            names = [model.camera(i).name for i in range(model.ncam)]
-            raise ValueError(f"no camera {camera!r}; choose one of {', '.join(names)}")
+            check_choice("camera", camera, [model.camera(i).name for i in range(model.ncam)])
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -149,13 +146,10 @@ class CameraRenderer:
 
 
 def _check_process() -> None:
-    """OpenGL's threads do not survive a fork: a child that renders would wait for them for ever."""
+    """Raise RuntimeError in the fork of a process that rendered, which would wait for OpenGL for ever."""
     global _rendering_process
     if _rendering_process not in (None, os.getpid()):
-        raise RuntimeError(
-            "this process was forked from one that had rendered, and OpenGL does not survive that: start it "
-            'with mp_start_method="spawn", or before anything is rendered'
-        )
+        raise RuntimeError("OpenGL does not survive the fork of a process that rendered: start it by spawn")
     _rendering_process = os.getpid()
     stop_forking()
 

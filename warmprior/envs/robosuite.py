@@ -19,6 +19,7 @@ from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
+from warmprior.modules.checks import check_choice, check_whole_numbers
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 
@@ -91,7 +92,7 @@ class RobosuiteEnv(EnvBase):
         >>> RobosuiteEnv("life")
         Traceback (most recent call last):
             ...
-        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, ...
+        ValueError: task must be one of lift, can, square, stack, transport, ..., got 'life'
     """
 
     def __init__(
@@ -118,14 +119,9 @@ class RobosuiteEnv(EnvBase):
     ) -> None:
         if sum(given is not None for given in (task, env_args, env)) != 1:
             raise ValueError("give one of task, env_args and env")
-        if style not in STYLES:
-            raise ValueError(f"style is one of {', '.join(STYLES)}, got {style!r}")
-        if control_loop not in _LOOPS:
-            raise ValueError(f"control_loop is {' or '.join(_LOOPS)}, got {control_loop!r}")
-        if horizon is not None and horizon < 1:
-            raise ValueError(f"horizon must be at least 1, got {horizon}")
-        if seed_stride < 1:
-            raise ValueError(f"seed_stride must be at least 1, got {seed_stride}")
+        check_choice("style", style, STYLES)
+        check_choice("control_loop", control_loop, _LOOPS)
+        check_whole_numbers(seed_stride=seed_stride, horizon=1 if horizon is None else horizon)
         size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
         if len(size) != 2 or min(size) < 1:
             raise ValueError(f"camera_size is a side or (height, width), got {camera_size!r}")
@@ -148,11 +144,7 @@ class RobosuiteEnv(EnvBase):
             # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
             # waits for a success that may never come.
             horizon = self._env.horizon
-            if not isinstance(horizon, int) or horizon < 1:
-                raise ValueError(
-                    f"the environment's horizon must be a number of steps, got {horizon!r}; give one with "
-                    "horizon="
-                )
+            check_whole_numbers(horizon=horizon)
         default = default_keys(len(self._env.robots))
         self.low_dim_keys = default if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
@@ -244,19 +236,19 @@ class RobosuiteEnv(EnvBase):
     def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
         # This runs between control steps of physics, which leave nothing of other code in the caches.
         state = [observations[key] for key in self.low_dim_keys]
-        found: dict[str, Any] = {
+        measured: dict[str, Any] = {
             keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
         }
         if self.from_pixels:
             frames = {camera: self.render_frame(camera) for camera in self.cameras}
-            found["pixels"] = frames if self.nested_pixels else frames[self.cameras[0]]
+            measured["pixels"] = frames if self.nested_pixels else frames[self.cameras[0]]
         if self.sim_state:
-            found[keys.SIM_STATE] = self._loop.state()
+            measured[keys.SIM_STATE] = self._loop.state()
         if self.eef_pose:
             arms = range(len(self._env.robots))
             poses = [np.column_stack(self._loop.eef(arm)[::-1]) for arm in arms]
-            found[keys.EEF_POSE] = np.stack(poses).astype(np.float32)
-        return found
+            measured[keys.EEF_POSE] = np.stack(poses).astype(np.float32)
+        return measured
 
     def _count(self, success: bool) -> _Flags:
         """Count a control step; what it means for the episode."""
@@ -274,8 +266,8 @@ class RobosuiteEnv(EnvBase):
         entries: list[dict[str, Any]] = [
             {"reward": reward, **{name: next(booleans) for name in _FLAGS}} for reward in rewards
         ]
-        for entry, found in zip(entries[len(flags) - len(measured) :], measured, strict=True):
-            for key, value in found.items():
+        for entry, values in zip(entries[len(flags) - len(measured) :], measured, strict=True):
+            for key, value in values.items():
                 nested = isinstance(value, dict)
                 entry[key] = TensorDict(value) if nested else torch.from_numpy(value)
         # Without the constructor's checks, which take longer than all of the above.
@@ -301,8 +293,7 @@ class RobosuiteEnv(EnvBase):
         tell observations; the others reward, ``"success"`` and done flags alone. Observations that are no
         poses are taken at every step.
         """
-        if keep < 1:
-            raise ValueError(f"keep must be at least 1, got {keep}")
+        check_whole_numbers(keep=keep)
         rows = actions.detach().cpu().double().unbind(0)
         flags: list[_Flags] = []
         states: list[np.ndarray] = []

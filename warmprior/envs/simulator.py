@@ -113,10 +113,8 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
         with _without_warnings():
             register_mimicgen()
     if name not in robosuite.ALL_ENVIRONMENTS:
-        raise ValueError(
-            f"robosuite has no environment {name!r}; if another package registers it, import that package "
-            f"first. Registered: {', '.join(sorted(robosuite.ALL_ENVIRONMENTS))}"
-        )
+        names = ", ".join(sorted(robosuite.ALL_ENVIRONMENTS))
+        raise ValueError(f"robosuite has no {name!r} unless its package is imported first; it has {names}")
     kwargs = dict(env_args["env_kwargs"])
     kwargs.update(
         has_renderer=False,

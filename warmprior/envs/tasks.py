@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from warmprior.modules.checks import check_choice
+
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.
 EVALUATION_SEED = 10_000_000
@@ -120,8 +122,7 @@ def get_task(name: str) -> TaskSpec:
         >>> get_task("square").observation_dim
         23
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; choose one of {', '.join(TASKS)}")
+    check_choice("task", name, TASKS)
     return TASKS[name]
 
 
