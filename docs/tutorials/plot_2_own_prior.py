@@ -14,7 +14,11 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from warmprior import GaussianPrior, PastPrior, Prior, policy_transforms
-from warmprior.diagnostics import HistoryShift, SharedObservations, executed_actions
+from warmprior.diagnostics import (
+    HistoryShift,
+    SharedObservations,
+    executed_actions,
+)
 from warmprior.envs import (
     NavigationEnv,
     navigation_demonstrations,
