@@ -31,12 +31,12 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from tensordict import TensorDict, TensorDictBase
-from throughput import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
 from lab.machine import check_device, facts_of_machine
+from lab.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from warmprior import (
     AdaLNTransformer,
     ChiTransformer,

@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import socket
-import statistics
 import tempfile
 import time
 from collections.abc import Callable
@@ -31,73 +30,24 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 from lab.machine import facts_of_machine
+from lab.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from warmprior import (
     ChiTransformer,
     Normalizer,
-    PastPrior,
     VelocityMLP,
     WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
 )
-from warmprior.data import LeRobotExperienceReplay
+from warmprior.data import LeRobotDemonstrations
 from warmprior.envs import RobosuiteEnv
-from warmprior.history import window_history
 from warmprior.io.distributed import joined, rank
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
 
-D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
-PRIOR = PastPrior(H)
-NFES = (1, 3, 9)
+BATCH = 256
 
 
-class Clock:
-    """Times several things in turn, so that the machine's drift meets all of them alike."""
-
-    def __init__(self, repeats: int, bar: tqdm) -> None:
-        self.repeats, self.bar = repeats, bar
-
-    def times(
-        self, *things: Callable[[], object], calls: int = 1, before: Callable[[], object] = int
-    ) -> list[list[float]]:
-        """Seconds per call, ``[thing][repeat]``; ``before`` runs untimed ahead of each round."""
-        found: list[list[float]] = [[] for _ in things]
-        for repeat in range(self.repeats + 1):
-            before()
-            # Every other round runs backwards: neither is always the one after the other.
-            for i in range(len(things)) if repeat % 2 else reversed(range(len(things))):
-                start = time.perf_counter()
-                for _ in range(calls):
-                    things[i]()
-                    if torch.cuda.is_initialized():
-                        torch.cuda.synchronize()
-                if repeat:  # the first round warms up
-                    found[i].append((time.perf_counter() - start) / calls)
-            self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")
-        return found
-
-    def ratio(self, thing: Callable[[], object], base: Callable[[], object], **options: Any) -> float:
-        """Median of the rounds' time of ``thing`` over that of ``base``."""
-        one, two = self.times(thing, base, **options)
-        return statistics.median(a / b for a, b in zip(one, two, strict=True))
-
-
-# What is measured on
-
-
-def steps(episodes: int, length: int) -> TensorDict:
-    """Demonstrations of random numbers."""
-    n = episodes * length
-    both = torch.rand(n, D_O + D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    observation, action = both.split((D_O, D_A), dim=-1)
-    episode = torch.arange(n) // length
-    return TensorDict({"observation": observation, "action": action, "episode": episode}, [n]).contiguous()
-
-
-def one_decision(device: str = "cpu") -> TensorDict:
-    """What a policy is given for one decision."""
-    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    return TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
+# Networks, and their trainings
 
 
 def paper_network() -> ChiTransformer:
@@ -199,7 +149,7 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
             "observation.state": [i / fps for i in range(1 - TO, 1)],
         }
         theirs = LeRobotDataset(name, root=root, delta_timestamps=offsets)
-        read = LeRobotExperienceReplay(root).data
+        read = LeRobotDemonstrations(root).data
         buffer = window_replay_buffer(read, PRIOR, batch_size=BATCH, observation_steps=TO)
         ratio = clock.ratio(
             lambda: [theirs[i] for i in torch.randint(len(data), (64,)).tolist()],

@@ -1,28 +1,26 @@
 """The picture of README and landing page: three sources, their flows, what is executed.
 
-python docs/figures/what_changes.py        # trains the toy's policies, two minutes, and writes docs/_static
+PYTHONPATH=benchmarks python docs/figures/what_changes.py
+
+It trains the toy's policies, which takes two minutes, and writes docs/_static/what_changes.png.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
-from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navigation_positions
-from warmprior.training import train_policy
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from navigation1d import NAVIGATION_PRESETS
 
 from lab.navigation import play_navigation
 from lab.plots import new_figure
 from lab.tasks import navigation_task
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
+from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navigation_positions
+from warmprior.training import train_policy
 
 OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
 ABOVE, BELOW = "#1f77b4", "#d95f02"

@@ -1,0 +1,176 @@
+"""Agents in source space: their options, the frozen policies that they act through, and environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass
+from functools import partial
+from itertools import product
+from typing import Annotated, Any, Literal, get_type_hints
+
+import tyro
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from lab.comparison import train_all
+from lab.methods import ColdPrior, Method
+from lab.options import FinishedRun, Options, check_given, check_single
+from lab.policies import facts_of, finished_policies, policies_of, trained_actors
+from lab.tasks import check_counts, check_network
+from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
+from warmprior.diagnostics.flow import sees_history
+from warmprior.envs import NavigationEnv
+from warmprior.envs.description import environment_parts
+from warmprior.rl import PriorSpaceConfig
+from warmprior.training import parallel_env
+from warmprior.transforms import EncodeObservation
+
+TOY = "navigation"
+
+# The recipe of an agent, without what the options that all experiments share say. On a command line they have
+# a prefix: gradient steps, say, are those of behaviour cloning in all experiments.
+HINTS = get_type_hints(PriorSpaceConfig)
+SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes", "delta")
+AgentOptions: Any = make_dataclass(
+    "AgentOptions",
+    [
+        (f.name, HINTS[f.name], field(default=f.default))
+        for f in fields(PriorSpaceConfig)
+        if f.name not in SHARED and f.default is not MISSING
+    ],
+    frozen=True,
+    namespace={"__doc__": str(PriorSpaceConfig.__doc__).replace("``", "")},
+)
+
+
+Algorithm = Literal["dsrl-na", "dsrl-sac"]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How an agent learns around the frozen policies of a method."""
+
+    method: Method
+    algorithm: str
+    centre: str  # of its box: the mean of the source, or zero
+    delta: float | None  # half its box
+
+    def __post_init__(self) -> None:
+        if self.centre == "zero" and self.method.has_anchor:
+            prior = self.method.prior()
+            if self.method.parts.start is not None or prior.history_length != prior.chunk_length:
+                raise ValueError(f"--centre zero: {self.method.name} has a centre of its own, leave it out")
+
+    def __str__(self) -> str:
+        given = self.method.arguments.get("sigma")
+        sigma = "" if given is None else f"sigma={given:g}"
+        source = ",".join(filter(None, (self.method.name, sigma, self.method.options)))
+        around = " around zero" if self.centre == "zero" and self.method.has_anchor else ""
+        box = "" if self.delta is None else f", delta {self.delta:g}"
+        return f"{self.algorithm} {source}{around}{box}"
+
+    def policy(self, actor: WarmPriorActor) -> WarmPriorActor:
+        """The policy as the agent sees it: around zero its source is cold, and its field as it was."""
+        if self.centre == "mean" or not self.method.has_anchor:
+            return actor
+        return actor.replace(prior=ColdPrior(actor.prior.chunk_length, actor.prior.prediction_chunks))
+
+
+@dataclass(frozen=True)
+class AgentsOptions(Options):
+    """A comparison of agents; the frozen policies are those of a comparison of sources."""
+
+    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
+    rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
+    algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
+    warm_algorithm: tuple[Algorithm, ...] = ()  # of sources with a mean (default: as --algorithm)
+    # Of policies whose source has a mean: where their agents search, around it or, as a control, around zero.
+    centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
+    delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
+    horizon: int | None = None  # time limit in control steps (default: the task's)
+    num_envs: int = 4  # parallel environments of an agent
+    # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
+    # itself collects).
+    collectors: int | None = None
+
+    @property
+    def is_toy(self) -> bool:
+        return self.data.task == (TOY,)
+
+    @property
+    def name(self) -> str:
+        return TOY if self.is_toy else super().name
+
+    def check(self) -> None:
+        check_counts(self, "horizon", "num_envs", "collectors")
+        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
+            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
+        if self.is_toy != (self.run.preset == "unit"):
+            raise ValueError(f"--task {TOY} and --preset unit belong together")
+        check_single(self, "task", "data", "chunk", "sigma", "nfe")
+        check_given(self, "algorithm", "centre")
+        if self.collectors is not None and self.run.engine != "ray":
+            raise ValueError("--collectors belongs to --engine ray")
+        if not self.is_toy and self.policies is None:
+            self.data.check()
+            check_network(self.network, self.data)
+        for method in self.sources.methods():
+            if not method.is_flow:
+                raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
+            for arm in self.arms(method):
+                self.agent(arm, 0)
+
+    def arms(self, method: Method) -> list[Arm]:
+        """The agents that learn around a method's policies."""
+        centres = self.centre if method.has_anchor else ("zero",)
+        algorithms = self.warm_algorithm if method.has_anchor else ()
+        parts = product(algorithms or self.algorithm, centres, self.delta or (None,))
+        return [Arm(method, *part) for part in parts]
+
+    def agent(self, arm: Arm, seed: int) -> PriorSpaceConfig:
+        shared: Mapping[str, Any] = asdict(self.rl)
+        own: dict[str, Any] = {
+            "algorithm": arm.algorithm,
+            "seed": seed,
+            "nfe": self.evaluation.nfe[0],
+            "evaluation_episodes": self.evaluation.episodes,
+            "backup_entropy": shared["backup_entropy"] or arm.algorithm == "dsrl-sac",
+            "delta": arm.delta,
+        }
+        return PriorSpaceConfig(**{**shared, **own})
+
+
+def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+    """The task, and the frozen policies by method and seed: of --run, or trained now."""
+    run = options.policies
+    policies = policies_of(options) if run is None else finished_policies(run, options)
+    if run is None:
+        train_all(options, policies)
+    actors = trained_actors(policies, options.run.device)
+    for method, group in actors.items():
+        if missing := sorted(set(options.seeds) - group.keys()):
+            print(f"--run has {len(group)} seeds of {method.text}: agents {missing} share policies")
+        several = list(group.values())
+        actors[method] = {s: group.get(s, several[s % len(several)]) for s in options.seeds}
+    return facts_of(policies[0].task()), actors
+
+
+def environment(
+    actor: WarmPriorActor, is_toy: bool, num_envs: int, options: Mapping[str, Any], seed: int
+) -> EnvBase:
+    """The environment of agents around a frozen policy; the simulator's is in workers."""
+    if is_toy:  # nothing but the anchor is random
+        transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
+        transforms.append(PriorAnchor(actor))
+        return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
+    make_env, make_transforms = environment_parts(actor)
+    workers = parallel_env(partial(make_env, **options), make_transforms, num_envs)
+    # Outside of the workers one anchor draws for all, and one encoder serves all.
+    env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
+    env.set_seed(seed, static_seed=True)
+    return env
+
+
+def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
+    """What turns images into features, for agents of a policy that sees images."""
+    return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []
