@@ -13,12 +13,13 @@ import pandas as pd
 
 from lab.files import PartialFailure, read_lines
 from lab.jobs import Jobs
+from lab.leader import go_on_alone
 from lab.measures import measure
 from lab.methods import Method
 from lab.options import Evaluation, Options
 from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.distributed import go_on_alone, rank, world_size
+from warmprior.io.distributed import rank, world_size
 from warmprior.io.files import check_writable, write_atomic
 from warmprior.training import Episode
 

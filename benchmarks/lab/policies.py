@@ -24,6 +24,7 @@ from filelock import FileLock
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 
+from lab.leader import leader_first
 from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
@@ -31,7 +32,7 @@ from lab.report import read_rows
 from lab.tasks import DataOptions, load_task, task_places
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import mean_revision, smoothness
-from warmprior.io.distributed import from_leader, leader_first, rank
+from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (

@@ -68,10 +68,9 @@ def joined() -> Iterator[None]:
 
 
 def from_leader[T](make: Callable[[], T]) -> T:
-    """What the first process makes of something that the others must not, or might not, make alike.
+    """Let the first process make something for all of them, which has to be picklable.
 
-    The first process calls it; its result has to be picklable. If it fails there, which the first process
-    tells, the others get a ``SystemExit``.
+    If it fails there, which the first process reports, the others get a ``SystemExit``.
 
     Examples:
         >>> from warmprior.io.distributed import from_leader
@@ -80,65 +79,28 @@ def from_leader[T](make: Callable[[], T]) -> T:
     """
     if world_size() == 1:
         return make()
-    found: list[T] = []
+    made: list[T] = []
     try:
         if not rank():
-            found.append(make())
+            made.append(make())
     finally:
-        parcel = [found]
+        parcel = [made]
         dist.broadcast_object_list(parcel, 0, _waiting)
     if not parcel[0]:
         raise SystemExit(2)
     return parcel[0][0]
 
 
-@contextmanager
-def leader_first() -> Iterator[None]:
-    """Let the first process do something before the others, which find it done.
-
-    If that ends in a ``FloatingPointError`` or ``ValueError``, which end a training and not the run, all get
-    it. After any other error, which the first process tells, the others get a ``SystemExit``.
-    """
-    failure: list[BaseException | None] = [SystemExit(2)]
-    try:
-        if not rank():
-            yield
-            failure = [None]
-    except (FloatingPointError, ValueError) as error:
-        kind = FloatingPointError if isinstance(error, FloatingPointError) else ValueError
-        failure = [kind(str(error))]
-        raise
-    finally:
-        if world_size() > 1:
-            dist.broadcast_object_list(failure, 0, _waiting)
-    if rank():
-        if failure[0] is not None:
-            raise failure[0]
-        yield
-
-
-def go_on_alone() -> None:
-    """Let the first process go on as if it had been started alone, and the others end, with success."""
-    ends = bool(rank())
-    from_leader(int)  # all have arrived
-    if dist.is_initialized():
-        dist.destroy_process_group()
-    if ends:
-        raise SystemExit(0)
-
-
 def check_batch(size: int) -> None:
-    """Refuse a batch, of so many windows of all processes, that cannot be divided among them.
+    """Raise ValueError for a batch, of all processes together, that cannot be divided among them.
 
     Examples:
         >>> from warmprior.io.distributed import check_batch
         >>> check_batch(0)
         Traceback (most recent call last):
             ...
-        ValueError: batch_size 0 cannot be divided among 1 process(es): choose a multiple of 1
+        ValueError: batch_size must be a multiple of the 1 process(es), got 0
     """
     count = world_size()
     if size < count or size % count:
-        raise ValueError(
-            f"batch_size {size} cannot be divided among {count} process(es): choose a multiple of {count}"
-        )
+        raise ValueError(f"batch_size must be a multiple of the {count} process(es), got {size}")

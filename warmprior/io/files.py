@@ -29,11 +29,11 @@ def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] |
     from safetensors.torch import save_file as save
 
     own: dict[str, Tensor] = {}
-    seen: set[int] = set()
+    written: set[int] = set()
     for name, value in tensors.items():
         memory = value.untyped_storage().data_ptr()
-        own[name] = value.clone() if memory in seen else value.contiguous()
-        seen.add(memory)
+        own[name] = value.clone() if memory in written else value.contiguous()
+        written.add(memory)
     try:
         save(own, path, metadata)
     except SafetensorError as error:
@@ -64,7 +64,7 @@ def is_repository(name: str) -> bool:
 
 
 def check_regular(path: Path) -> None:
-    """Refuse a path where there is no file, or another thing: a pipe or a device may never answer."""
+    """Raise an error where there is no file, or something else: a pipe or a device may never answer."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
     if not path.is_file():
@@ -125,9 +125,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise OSError(
-            f"cannot write {path}: {error}. Free some space or choose another output folder."
-        ) from error
+        raise OSError(f"cannot write {path}: {error}; free space or choose another folder") from error
     finally:
         with contextlib.suppress(OSError):  # a read-only folder never received the file
             temporary.unlink(missing_ok=True)
@@ -158,9 +156,7 @@ def check_writable(directory: Path) -> None:
             probe.write(b"ok")
             os.fsync(probe.fileno())
     except OSError as error:
-        raise OSError(
-            f"cannot write to {directory}: {error}. Free some space or choose another output folder."
-        ) from error
+        raise OSError(f"cannot write to {directory}: {error}; free space or choose another folder") from error
 
 
 @contextlib.contextmanager
@@ -179,7 +175,7 @@ def exclusive(directory: Path) -> Iterator[None]:
         ...         pass
         Traceback (most recent call last):
             ...
-        BlockingIOError: ... is in use by another process: wait until that has ended, or choose another folder
+        BlockingIOError: ... is in use by another process: wait, or choose another
     """
     directory.mkdir(parents=True, exist_ok=True)
     folder = os.open(directory, os.O_RDONLY)
@@ -188,13 +184,10 @@ def exclusive(directory: Path) -> Iterator[None]:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BlockingIOError(
-                f"{directory} is in use by another process: wait until that has ended, or choose another "
-                "folder"
+                f"{directory} is in use by another process: wait, or choose another"
             ) from None
         except OSError as error:
-            warnings.warn(
-                f"{directory} cannot be locked ({error}): let one process at a time use it", stacklevel=3
-            )
+            warnings.warn(f"{directory} cannot be locked ({error}): use it in one process", stacklevel=3)
         yield
     finally:
         os.close(folder)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from typing import Any
 
 import torch
@@ -58,7 +58,7 @@ def run_script(
     try:
         if launched() and not together:
             raise ValueError("it trains with one process; start it without torchrun")
-        with joined(), _printing():
+        with joined(), open(os.devnull, "w") as nowhere, redirect_stdout(nowhere if rank() else sys.stdout):
             script()
     except BaseException as error:
         if interrupted:  # whatever the libraries in between have made of it
@@ -73,13 +73,3 @@ def run_script(
     finally:
         signal.signal(signal.SIGINT, before)
     return 0
-
-
-@contextmanager
-def _printing() -> Iterator[None]:
-    """Let the first of several processes print, and no other."""
-    if not rank():
-        yield
-        return
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-        yield
