@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from warmprior import ActionWindow, PastPrior, PreviewPrior, WithheldHistory, window_replay_buffer
-from warmprior.transforms.window import check_finite
+from warmprior.modules.checks import check_finite_steps
 
 
 def steps(lengths, numbers=None):
@@ -158,11 +158,11 @@ def test_data_that_cannot_be():
 @pytest.mark.parametrize("bad", [0, 777, 1999])
 def test_bad_values_are_located_in_every_part_of_the_data(bad):
     value = torch.zeros(2000, 3)
-    check_finite("observation", value, memory=90)
+    check_finite_steps("observation", value, memory=90)
     value[bad, 2] = float("nan")
     value[1999, 1] = float("inf")
     with pytest.raises(ValueError, match=f"'observation' holds NaN or Inf, first at step {bad}$"):
-        check_finite("observation", value, memory=90)
+        check_finite_steps("observation", value, memory=90)
 
 
 def test_a_buffer_that_cannot_be():

@@ -245,7 +245,7 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
     """Return the sides in pixels of a demo's images, after checking that they are what they should be."""
     sizes = {}
     for key in keys:
-        images = member(demo, f"obs/{key}", "dataset")
+        what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
         if images is None:
             others = [name for name in names(demo["obs"]) if name.endswith("_image") and name != key]
             raise unknown(_place(demo), "images", key, others)
@@ -253,8 +253,8 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
         side = shape[1] if len(shape) == 4 else 0
         if images.dtype != "uint8" or shape != (steps, side, side, 3):
             kind = f"shape {shape} and type {images.dtype}"
-            raise DatasetError(f"{_place(images)} has {kind}; images are uint8 ({steps}, side, side, 3)")
-        sizes[side] = _place(images)
+            raise DatasetError(f"{what} has {kind}; images are uint8 ({steps}, side, side, 3)")
+        sizes[side] = what
     return sizes
 
 

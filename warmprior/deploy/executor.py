@@ -19,7 +19,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.history import advance, cold_history
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.checks import check_between, check_finite, check_shape, check_whole_numbers
 from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
@@ -97,9 +97,7 @@ class AsyncExecutor:
                 observation_steps = getattr(network, "observation_steps", None)
         observation_steps = 2 if observation_steps is None else observation_steps
         if prior is None or action_dim is None:
-            raise ValueError(
-                f"{type(actor).__name__} has no prior or action width: give prior and action_dim"
-            )
+            raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
         if latency is not None:
             if pool is not None:
                 raise ValueError("a simulated latency computes in the calling thread: leave out pool")
@@ -110,10 +108,7 @@ class AsyncExecutor:
             execute = min(prior.chunk_length, length - delay)
         check_delay(delay, execute, length)
         check_whole_numbers(execute=execute)
-        if not 1 <= execute <= prior.chunk_length:
-            raise ValueError(
-                f"need 1 <= execute <= {prior.chunk_length}, the prior's chunk length, got {execute}"
-            )
+        check_between(1, prior.chunk_length, execute=execute)
         self.prior, self.execute, self.timeout, self.latency = prior, execute, timeout, latency
         self.actor = actor.eval()
         self._shape = (length, action_dim)
@@ -158,7 +153,9 @@ class AsyncExecutor:
         self._chunk, self._left, self._executed = self._history["forecast"], 0, 0
 
     def act(self, observation: Tensor | TensorDictBase) -> Tensor:
-        """The action of this control step, ``[d_a]`` on the CPU, at ``[d_o]``, or a tensordict ``[]``.
+        """Return this control step's action, ``[d_a]`` on the CPU, for a raw observation.
+
+        That is ``[d_o]``, or a tensordict ``[]`` with several entries.
 
         Raises:
             TimeoutError: if no action is left, and the next chunk is not ready in time.
@@ -234,11 +231,10 @@ class AsyncExecutor:
         if self._sees_history:
             data = HistoryObservation()(data)
         chunk = self.actor(data.to(self._device)).get(keys.CHUNK)
-        if chunk is None or tuple(chunk.shape) != self._shape:
-            found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
-            raise ValueError(f"expected a chunk [P, d_a] = {self._shape} at {keys.CHUNK}, found {found}")
-        if not chunk.isfinite().all():
-            raise FloatingPointError("the policy's chunk holds NaN or infinity")
+        if chunk is None:
+            raise ValueError(f"the policy wrote no chunk at {keys.CHUNK}")
+        check_shape("the policy's chunk", chunk, self._shape)
+        check_finite({"the policy's chunk": chunk}, "it is not executed")
         return chunk.to(self._chunk)
 
     def _collect(self) -> None:
@@ -271,9 +267,8 @@ class AsyncExecutor:
                 self._pending.exception(None if self._first else self.timeout)
             except NotDone as late:
                 raise TimeoutError(
-                    f"the next chunk is not ready after {self._executed} control steps and {self.timeout} s, "
-                    "and no action is left. Hold the robot and call again, execute fewer actions per "
-                    "decision, predict longer chunks, or make the policy faster"
+                    f"no action is left after {self._executed} control steps and {self.timeout} s. Hold the "
+                    "robot and call again; execute fewer actions, or predict longer chunks"
                 ) from late
         self._collect()
 

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.modules.checks import check_finite_steps, check_keys
 from warmprior.transforms.delay import executed_chunk
 
 
@@ -67,12 +68,9 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         >>> actions.flatten().tolist(), decision.tolist()
         ([0.0, 1.0, 3.0, 4.0, 5.0], [0, 0, 1, 1, 1])
     """
-    steps = rollout.get(("next", keys.EXECUTED), None)
-    if rollout.get(keys.CHUNK, None) is None or steps is None:
-        raise KeyError(
-            f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}'): roll out a chunk policy in "
-            "an environment with ChunkStep"
-        )
+    needed = (keys.CHUNK, ("next", keys.EXECUTED))
+    check_keys(rollout, needed, "executed_actions", ": roll out a chunk policy with ChunkStep")
+    steps = rollout.get(needed[1])
     if rollout.ndim < 1 or rollout.batch_size.numel() == 0:
         raise ValueError(f"a rollout is [*B, D] with D > 0 decisions, got {tuple(rollout.shape)}")
     done = rollout.get(("next", "done"), None)
@@ -94,8 +92,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     valid = kept.gather(-1, order)
     flat = chunk.flatten(-3, -2)
     actions = flat.gather(-2, order.unsqueeze(-1).expand(*order.shape, flat.shape[-1]))
-    if not torch.isfinite(actions[valid]).all():
-        raise ValueError("the rollout holds executed actions that are NaN or infinite")
+    check_finite_steps("executed actions", actions[valid])
     return (
         actions.masked_fill(~valid.unsqueeze(-1), math.nan),
         decision.flatten(-2).gather(-1, order).masked_fill(~valid, -1),

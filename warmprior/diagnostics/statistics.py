@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from warmprior.io.extras import require
+from warmprior.modules.checks import check_between, check_whole_numbers
 
 RESAMPLES = 2_000
 """Of a bootstrap."""
@@ -36,8 +37,7 @@ def success_posterior(successes: int, episodes: int) -> Any:
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
         0.833
     """
-    if not 0 <= successes <= episodes:
-        raise ValueError(f"need 0 <= successes <= episodes, got {successes} and {episodes}")
+    check_between(0, episodes, successes=successes)
     return require("scipy.stats", "sim").beta(successes + 1, episodes - successes + 1)
 
 
@@ -104,8 +104,7 @@ def paired_probability_better(wins: int, losses: int) -> float:
         >>> round(paired_probability_better(3, 0), 4), round(paired_probability_better(4, 4), 4)  # 15 / 16
         (0.9375, 0.5)
     """
-    if wins < 0 or losses < 0:
-        raise ValueError(f"need counts of at least 0, got {wins} and {losses}")
+    check_whole_numbers(0, wins=wins, losses=losses)
     return float(success_posterior(wins, wins + losses).sf(0.5))
 
 
@@ -157,7 +156,7 @@ def bootstrap_ratio(
     ratio = float(total[0] / total[1])
     if len(sums) == 1:
         return ratio, math.nan, math.nan
-    found = require("scipy.stats", "sim").bootstrap(
+    result = require("scipy.stats", "sim").bootstrap(
         tuple(sums.T.numpy()),
         lambda above, below, axis: above.sum(axis) / below.sum(axis),
         n_resamples=RESAMPLES,
@@ -166,4 +165,4 @@ def bootstrap_ratio(
         method="percentile",
         rng=np.random.default_rng(int(torch.randint(2**62, (), generator=generator))),
     )
-    return ratio, float(found.confidence_interval.low), float(found.confidence_interval.high)
+    return ratio, float(result.confidence_interval.low), float(result.confidence_interval.high)

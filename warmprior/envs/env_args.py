@@ -18,21 +18,8 @@ from warmprior.rotation import (
     rotvec_to_matrix,
 )
 
-_ARMS = ("right", "left")
 _RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"}
 _OUTPUT_MAX = (0.05, 0.05, 0.05, 0.5, 0.5, 0.5)
-
-
-def _modernize_part(part: dict[str, Any], old: bool) -> None:
-    for before, after in _RENAMED.items():
-        if before in part:
-            part[after] = part.pop(before)
-    delta = part.pop("control_delta", True)
-    part.setdefault("input_type", "delta" if delta else "absolute")
-    # Up to robosuite 1.4 a delta was in the world frame; from 1.5 on it is in the robot's base
-    # frame unless the file says otherwise. Bases that face each other make the two differ.
-    part.setdefault("input_ref_frame", "world" if old else "base")
-    part.setdefault("gripper", {"type": "GRIP"})
 
 
 def _modernize_controller(config: dict[str, Any]) -> dict[str, Any]:
@@ -41,9 +28,16 @@ def _modernize_controller(config: dict[str, Any]) -> dict[str, Any]:
         config = {"type": "BASIC", "body_parts": {"right": config}}
     parts = config["body_parts"]
     parts.update(parts.pop("arms", {}))
-    for name in _ARMS:
-        if name in parts:
-            _modernize_part(parts[name], old)
+    for part in [parts[name] for name in ("right", "left") if name in parts]:
+        for before, after in _RENAMED.items():
+            if before in part:
+                part[after] = part.pop(before)
+        delta = part.pop("control_delta", True)
+        part.setdefault("input_type", "delta" if delta else "absolute")
+        # Up to robosuite 1.4 a delta was in the world frame; from 1.5 on it is in the robot's base
+        # frame unless the file says otherwise. Bases that face each other make the two differ.
+        part.setdefault("input_ref_frame", "world" if old else "base")
+        part.setdefault("gripper", {"type": "GRIP"})
     return config
 
 

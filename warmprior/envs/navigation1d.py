@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from warmprior import keys
-from warmprior.modules.checks import check_between, check_shape, check_whole_numbers
+from warmprior.modules.checks import check_between, check_finite_steps, check_shape, check_whole_numbers
 
 STEPS = 64
 OBSTACLES = (-0.45, 0.45)
@@ -166,25 +166,16 @@ class NavigationEnv(EnvBase):
         self.route = None if route is None else dict(zip(_middles(), route, strict=True))
         shape = (*self.batch_size, 1)
 
-        def flag() -> Categorical:
-            return Categorical(2, shape=shape, dtype=torch.bool, device=device)
-
-        def carried() -> dict[str, Unbounded | Categorical]:
-            return {
-                "step_index": Unbounded(shape, dtype=torch.int64, device=device),
-                "height": Unbounded(shape, device=device),
-                "collided": flag(),
-            }
-
-        self.observation_spec = Composite(
-            {
-                keys.OBSERVATION: Bounded(-1, 1, (*self.batch_size, 1 + 2 * octaves), device=device),
-                "success": flag(),
-                **carried(),
-            },
-            shape=self.batch_size,
-        )
-        self.state_spec = Composite(carried(), shape=self.batch_size)
+        flag = Categorical(2, shape=shape, dtype=torch.bool, device=device)
+        carried = {
+            "step_index": Unbounded(shape, dtype=torch.int64, device=device),
+            "height": Unbounded(shape, device=device),
+            "collided": flag,
+        }
+        self.state_spec = Composite(carried, shape=self.batch_size).clone()
+        position = Bounded(-1, 1, (*self.batch_size, 1 + 2 * octaves), device=device)
+        entries = {keys.OBSERVATION: position, "success": flag, **carried}
+        self.observation_spec = Composite(entries, shape=self.batch_size).clone()
         # Policies may leave the corridor of the demonstrations: that is a result, not an error.
         self.action_spec = Unbounded(shape, device=device)
         self.reward_spec = Unbounded(shape, device=device)
@@ -279,8 +270,7 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
         (0.0, 0.0, 1.0, 0.0)
     """
     check_shape("heights", heights, (max(1, heights.numel() // STEPS), STEPS))
-    if not torch.isfinite(heights).all():
-        raise ValueError("the heights hold NaN or Inf")
+    check_finite_steps("heights", heights)
     check_between(1, STEPS - 1, chunk_length=chunk_length)
     x, demonstrations = navigation_positions().to(heights.device), navigation_heights()
     side = torch.where(heights.abs() > UNDECIDED, heights.sign(), 0.0)

@@ -73,6 +73,18 @@ def check_positions(key: NestedKey, chunk: Tensor, prior: Any) -> None:
         )
 
 
+def check_finite_steps(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
+    """Raise ValueError for the first NaN or infinity of data ``[N, *]``, which may be memory-mapped."""
+    if not value.is_floating_point():
+        return
+    steps = max(1, memory * len(value) // max(1, value.numel()))
+    for first in range(0, len(value), steps):
+        finite = torch.isfinite(value[first : first + steps]).flatten(1).all(1)
+        if not finite.all():
+            bad = first + int((~finite).nonzero()[0])
+            raise ValueError(f"{key!r} holds NaN or Inf, first at step {bad}")
+
+
 def check_finite(
     tensors: Mapping[Any, Tensor],
     cause: str = "the training has diverged; lower the learning rate or check the rewards",

@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.history import window_history
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.checks import check_finite_steps, check_whole_numbers
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
@@ -159,20 +159,8 @@ def _checked(
         nested = observation.items(True, True)
         observations = {unravel_key((observation_key, key)): value for key, value in nested}
     for key, value in (*observations.items(), (keys.ACTION, action)):
-        check_finite(key, value)
+        check_finite_steps(key, value)
     return observations, action, episode.flatten()
-
-
-def check_finite(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
-    """A ``ValueError`` names the first NaN or infinity of an entry ``[N, *]``, memory-mapped perhaps."""
-    if not value.is_floating_point():
-        return
-    steps = max(1, memory * len(value) // max(1, value.numel()))
-    for first in range(0, len(value), steps):
-        finite = torch.isfinite(value[first : first + steps]).flatten(1).all(1)
-        if not finite.all():
-            bad = first + int((~finite).nonzero()[0])
-            raise ValueError(f"{key!r} holds NaN or Inf, first at step {bad}")
 
 
 def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
