@@ -82,5 +82,5 @@ def test_history_through_the_preprocessor(policy, preprocessed):
         torch.testing.assert_close(seen.x[0][..., :ACTION], expected)
     # It keeps the first actions of a longer window, which are the history.
     cut = {**observations("groot", 3), **preprocess(raw), "action_is_pad": is_pad}
-    with pytest.raises(ValueError, match=r"windows of \[8\] actions, expected \[16\]"):
+    with pytest.raises(ValueError, match=r"'action': 8\} actions, expected \{'action': 16"):
         adapter.loss(cut)

@@ -168,7 +168,7 @@ class Pi0:
 
 
 def test_what_is_not_supported(policy):
-    with pytest.raises(ValueError, match=r"Other of lerobot .* is not supported: .* smolvla"):
+    with pytest.raises(ValueError, match=r"Other of lerobot .* is not supported; .* smolvla"):
         port_for(Other())
     with pytest.raises(ValueError, match="adapt_to_pi_aloha"):
         port_for(policy("smolvla", adapt_to_pi_aloha=True))

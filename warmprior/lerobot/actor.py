@@ -13,8 +13,8 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.history import ENTRIES
-from warmprior.lerobot.ports import check_steps
 from warmprior.lerobot.source import ChunkSource
+from warmprior.modules.checks import check_shape, check_whole_numbers
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
 
@@ -41,7 +41,7 @@ class LeRobotFlow(TensorDictModuleBase):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        check_steps(nfe)
+        self.check_nfe(nfe)
         # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
         # contain this.
         self._policy = (policy,)
@@ -59,15 +59,16 @@ class LeRobotFlow(TensorDictModuleBase):
         return self._policy[0]
 
     def check_nfe(self, nfe: int | None) -> None:
-        """A ``ValueError`` unless ``nfe`` is a number of integration steps."""
-        check_steps(nfe)
+        """Raise ValueError unless ``nfe`` is a number of integration steps, or ``None``."""
+        if nfe is not None:
+            check_whole_numbers(nfe=nfe)
 
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, padding: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
         nfe = self.nfe if nfe is None else nfe
-        check_steps(nfe)
+        self.check_nfe(nfe)
         noise = tensordict[keys.NOISE]
         if torch.is_grad_enabled() and noise.requires_grad:
             raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
@@ -77,14 +78,9 @@ class LeRobotFlow(TensorDictModuleBase):
         if padding is None:
             # One draw for all rows, so that a chunk does not depend on the other rows.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
-            padding = self.source.place(a0[:1].detach(), generator)
-        wanted = (self.source.length, self.source.width)
-        if padding.shape not in ((1, *wanted), (len(a0), *wanted)):
-            raise ValueError(
-                f"padding must be {[len(a0), *wanted]}, the whole source of every row, got "
-                f"{list(padding.shape)}"
-            )
-        whole = padding.expand(len(a0), -1, -1).clone()
+            padding = self.source.place(a0[:1].detach(), generator).expand(len(a0), -1, -1)
+        check_shape("padding", padding, (len(a0), self.source.length, self.source.width))
+        whole = padding.clone()
         whole[:, self.source.positions, : self.source.action_dim] = a0
         chunks: list[Tensor] = []
 
@@ -105,20 +101,15 @@ class LeRobotFlow(TensorDictModuleBase):
         if isinstance(observation, Tensor):
             entries = {"observation.state": observation}
         else:
-            unnamed = set(observation.keys()) - set(self.names)
-            if unnamed:
-                raise ValueError(
-                    f"LeRobot's names of {', '.join(sorted(unnamed))} are missing: give names, such as "
-                    "names={'state': 'observation.state'}"
-                )
+            if unnamed := sorted(set(observation.keys()) - set(self.names)):
+                raise ValueError(f"names lacks {unnamed}: give names={{'state': 'observation.state', ...}}")
             entries = {self.names[str(name)]: value for name, value in observation.items()}
         steps = self.policy.config.n_obs_steps
         inputs: dict[str, Any] = {}
         for name, value in entries.items():
-            if value.shape[1] < steps:
+            if (count := value.shape[1]) < steps:
                 raise ValueError(
-                    f"{name} has {value.shape[1]} observations, but the policy sees {steps}: append "
-                    f"ObservationStack({steps})"
+                    f"{name} has {count} of {steps} observations: append ObservationStack({steps})"
                 )
             value = value[:, -1] if steps == 1 else value[:, -steps:]
             inputs[name] = value / 255.0 if value.dtype == torch.uint8 else value
@@ -181,9 +172,7 @@ class LeRobotActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if getattr(policy.config, "use_relative_actions", False):
-            raise ValueError(
-                "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
-            )
+            raise ValueError("relative actions (use_relative_actions) need WarmPriorAdapter")
         source = ChunkSource(policy, prior, std)
         self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
         self.network = self.ode.network

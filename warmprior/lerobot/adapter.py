@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from warmprior.lerobot.memory import ActionMemory
-from warmprior.lerobot.ports import Velocity, check_steps
+from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
+from warmprior.modules.checks import check_between, check_shape, check_whole_numbers
+from warmprior.modules.ode import Velocity
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
@@ -47,10 +49,10 @@ class RelativeActions:
         )
 
         def step(pipeline: Any, kind: type) -> Any:
-            found = [step for step in pipeline.steps if isinstance(step, kind)]
-            if not found:
+            steps = [step for step in pipeline.steps if isinstance(step, kind)]
+            if not steps:
                 raise ValueError(f"relative actions need a {kind.__name__} in the pipeline")
-            return found[0]
+            return steps[0]
 
         self._relative = step(preprocessor, RelativeActionsProcessorStep)
         self._normalize = step(preprocessor, NormalizerProcessorStep)
@@ -164,26 +166,18 @@ class WarmPriorAdapter:
     ) -> None:
         self.source = ChunkSource(policy, prior, std)
         if getattr(policy, "warm_adapter", None) is not None:
-            raise ValueError(
-                f"{type(policy).__name__} starts from {policy.warm_adapter.prior} by itself: use its own "
-                "methods, or policy.warm_adapter"
-            )
+            raise ValueError(f"{type(policy).__name__} has a prior of its own: use policy.warm_adapter")
         self.policy, self.prior, self.generator = policy, prior, generator
         steps = policy.config.n_action_steps
-        if steps > prior.chunk_length:
-            raise ValueError(
-                f"the policy executes n_action_steps={steps} of each chunk, but {prior} remembers "
-                f"chunk_length={prior.chunk_length}: set n_action_steps to {prior.chunk_length} or fewer"
-            )
+        check_between(1, prior.chunk_length, n_action_steps=steps)  # no more than the prior remembers
         if getattr(policy.config, "use_relative_actions", False) and relative is None:
             raise ValueError(
-                "the policy has relative actions, so that remembered ones must be expressed at the next "
-                "state: give relative=RelativeActions(preprocessor, postprocessor)"
+                "use_relative_actions needs relative=RelativeActions(preprocessor, postprocessor)"
             )
-        if not 0.0 <= cold_probability <= 1.0:
-            raise ValueError(f"cold_probability must be in [0, 1], got {cold_probability}")
+        check_between(0, 1, cold_probability=cold_probability)
         self.cold_probability, self.nfe = cold_probability, nfe
-        check_steps(nfe)
+        if nfe is not None:
+            check_whole_numbers(nfe=nfe)
         self.guidance = guidance
         if guidance is not None:
             self.source.port.guiding(policy, self._guided)  # refuses what cannot be guided
@@ -215,8 +209,7 @@ class WarmPriorAdapter:
             KeyError: if ``"action"`` or its mask is missing.
             ValueError: if the window or its mask has another length, or noise is given.
         """
-        if kwargs.get("noise") is not None:
-            raise ValueError("the prior gives noise=: leave it out")
+        check_no_noise(kwargs)
         before, valid, target, is_pad = self._window(batch)
         a0 = self.source.learn(before, valid, target, self.generator, self.cold_probability)
         inputs = dict(batch)
@@ -225,10 +218,7 @@ class WarmPriorAdapter:
         inputs["action"], inputs["action_is_pad"] = target, is_pad
 
         def source(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
-            if shape != a0.shape:
-                raise ValueError(
-                    f"the policy draws noise of shape {tuple(shape)}, but its source has {tuple(a0.shape)}"
-                )
+            check_shape("the source", a0, shape)
             return a0.to(dtype=dtype, device=device)
 
         with self.source.port.training(self.policy, source):
@@ -250,10 +240,7 @@ class WarmPriorAdapter:
         """
         steps, length = self.policy.config.n_action_steps, self.prior.prediction_length
         if self.guidance is not None and steps >= length:
-            raise ValueError(
-                f"n_action_steps={steps} executes all of a chunk of {length}, and leaves nothing that "
-                "guidance could continue: set it lower, or leave out guidance"
-            )
+            raise ValueError(f"guidance needs n_action_steps below the chunk's {length}, got {steps}")
         with self._from_source():
             action = (self.policy.select_action if select is None else select)(batch, **kwargs)
         self._memory.step()
@@ -291,8 +278,7 @@ class WarmPriorAdapter:
             self._memory.executed(executed_steps)
         elif self._memory.waits:
             self._memory.executed(self.policy.config.n_action_steps)
-        if not isinstance(delay, int) or isinstance(delay, bool) or delay < 0:
-            raise ValueError(f"delay must be a whole number of at least 0, got {delay!r}")
+        check_whole_numbers(0, delay=delay)
         self._delay = delay
         try:
             with self._from_source():
@@ -354,26 +340,17 @@ class WarmPriorAdapter:
         expected = {"action": len(self.action_indices)}
         if HISTORY in batch:
             expected = {"action": length, HISTORY: history}
-        missing = [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]
-        if missing:
+        if missing := [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]:
             raise KeyError(
-                f"the batch lacks {' and '.join(missing)}: the history would leak the target without the "
-                "mask that LeRobotDataset gives with delta_timestamps"
+                f"the batch lacks {' and '.join(missing)}: LeRobotDataset gives it by delta_timestamps"
             )
-        given = {key: batch[key].shape[1] for key in expected}
-        if given != expected:
+        lengths = {key: batch[key].shape[1] for key in expected}
+        if lengths != expected:
             raise ValueError(
-                f"the batch has windows of {[*given.values()]} actions, expected {[*expected.values()]}: "
-                f"{history} before the current step and T={length} of the chunk. Take the steps of "
-                "adapter.action_indices from the dataset"
+                f"windows have {lengths} actions, expected {expected}: use adapter.action_indices"
             )
         for key in expected:
-            mask, wanted = batch[f"{key}_is_pad"].shape, batch[key].shape[:2]
-            if mask != wanted:
-                raise ValueError(
-                    f"{key}_is_pad has shape {tuple(mask)}, expected {tuple(wanted)}: it marks padding among "
-                    "all actions of the window, those of the history included"
-                )
+            check_shape(f"{key}_is_pad", batch[f"{key}_is_pad"], batch[key].shape[:2])
         actions, is_pad = batch["action"], batch["action_is_pad"].bool()
         if HISTORY in batch:
             past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
@@ -403,8 +380,8 @@ class WarmPriorAdapter:
         if self._delay and len(going_on):
             (self.guidance or RealTimeChunking()).check_delay(self._delay, int(going_on.min()))
         rest, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
-        mine = (..., self.source.positions, slice(self.source.action_dim))
-        rest[mine], width[mine] = history["forecast"].to(dtype), scale
+        predicted = (..., self.source.positions, slice(self.source.action_dim))
+        rest[predicted], width[predicted] = history["forecast"].to(dtype), scale
         self._rest = rest, left, delay, width
         return self.source.place(a0, self.generator).to(dtype)
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from warmprior.history import advance, cold_history, without
+from warmprior.modules.checks import check_between, check_shape
 from warmprior.modules.prior import Prior
 
 
@@ -55,8 +56,8 @@ class ActionMemory:
             if move is not None:  # where there is no action, it stays empty
                 line = torch.cat([history["actions"], history["forecast"]], 1)
                 step = torch.arange(line.shape[1], device=line.device) - history["actions"].shape[1]
-                known = (step >= -history["steps"]) & (step < history["forecast_steps"])
-                line = torch.where(known[..., None], move(line).to(line), 0.0)
+                real = (step >= -history["steps"]) & (step < history["forecast_steps"])
+                line = torch.where(real[..., None], move(line).to(line), 0.0)
                 history.update({"actions": line[:, step < 0], "forecast": line[:, step >= 0]})
         self._decision = history
         return history
@@ -85,11 +86,8 @@ class ActionMemory:
         if self._chunk is None:
             return
         count = torch.as_tensor(steps, device=self._executed.device)
-        if count.min() < 0 or count.max() > self.prior.chunk_length:
-            raise ValueError(
-                f"executed_steps must be from 0 to chunk_length={self.prior.chunk_length} of "
-                f"{self.prior}, got {count.flatten().tolist()}"
-            )
+        for number in count.flatten().tolist():
+            check_between(0, self.prior.chunk_length, executed_steps=number)
         counted = self._new[:, None] & (count.ndim == 0)
         self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
 
@@ -106,11 +104,7 @@ class ActionMemory:
             self._chunk = None
         elif self._chunk is not None:
             rows = torch.as_tensor(mask, dtype=torch.bool, device=self._new.device)
-            if rows.shape != self._new.shape:
-                raise ValueError(
-                    f"the mask of environments has shape {tuple(rows.shape)}, expected "
-                    f"{tuple(self._new.shape)}: one bool per environment"
-                )
+            check_shape("mask of environments", rows, self._new.shape)
             # The rest of the chunk is still executed, as the first actions of the new episode.
             rest = advance(self._history, self._chunk, self._executed)["forecast"]
             self._chunk = torch.where(rows[:, None, None], rest, self._chunk)

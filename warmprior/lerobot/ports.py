@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial, wraps
@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+
+from warmprior.modules.ode import Velocity
 
 Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
 """``(shape [B, T, D], dtype, device) -> a_0``: replaces a draw."""
@@ -65,25 +67,24 @@ class SourceInjection(TorchFunctionMode):
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         """Check the count, unless an error is under way."""
         super().__exit__(kind, error, trace)
-        if kind is None and self.draws != 1:
+        if kind is None:
             length, width = self.expected
-            raise RuntimeError(
-                f"the policy drew normal noise of shape [B, {length}, {width}] {self.draws} times, not "
-                "once: its source cannot be replaced. Use the version of lerobot that this port is for"
-            )
+            _check_once(f"the policy drew normal noise of shape [B, {length}, {width}]", self.draws)
 
 
-Velocity = Callable[[Tensor, Tensor], Tensor]
-"""``(t [B], a_t [B, T, D]) -> [B, T, D]``."""
+def _check_once(what: str, times: int) -> None:
+    if times != 1:
+        raise RuntimeError(f"{what} {times} times, not once: its source cannot be replaced in this lerobot")
+
 
 Record = Callable[[Tensor], None]
 """Takes what a sampler returned, ``[B, T, >= d_a]``."""
 
 
-def check_steps(nfe: int | None) -> None:
-    """A ``ValueError`` for a number of integration steps below 1."""
-    if nfe is not None and nfe < 1:
-        raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
+def check_no_noise(options: Mapping[str, Any]) -> None:
+    """Raise ValueError if a call gives the noise that the prior gives."""
+    if options.get("noise") is not None:
+        raise ValueError("the prior gives noise=: leave it out, or leave out the second prior")
 
 
 @contextmanager
@@ -152,7 +153,7 @@ class FlowPort:
         return getattr(policy.config.normalization_mapping.get("ACTION"), "value", None)
 
     def check(self, policy: Any) -> None:
-        """Refuse options that would make the source inexact, with a ``ValueError`` that names one."""
+        """Raise ValueError for an option that would make the source inexact."""
 
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
         """Context of one ``policy.forward``, whose loss uses this source."""
@@ -193,16 +194,13 @@ class OpenPiPort(FlowPort):
     """For pi0, pi0.5 and SmolVLA, whose models take the noise as an argument (compiled ones too)."""
 
     def check(self, policy: Any) -> None:
-        """Of the options that only these have."""
+        """Raise ValueError if actions are in another space than the model's."""
         if getattr(policy.config, "adapt_to_pi_aloha", False):
-            raise ValueError(
-                "adapt_to_pi_aloha=True gives actions in another space than the model's, so the source "
-                "would have the wrong mean: convert the dataset instead, and turn it off"
-            )
+            raise ValueError("adapt_to_pi_aloha=True: convert the dataset to the model's actions instead")
 
     @contextmanager
     def training(self, policy: Any, source: Source) -> Iterator[None]:
-        """The model's argument."""
+        """Pass the source to the model as an argument."""
         signature, calls = inspect.signature(type(policy.model).forward), []
 
         def from_source(forward: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -214,27 +212,19 @@ class OpenPiPort(FlowPort):
 
         with _around(policy, "model.forward", from_source):
             yield
-        if len(calls) != 1:
-            raise RuntimeError(
-                f"{type(policy).__name__} evaluated its model {len(calls)} times in one loss, not once: its "
-                "source cannot be replaced. Use the version of lerobot that this port is for"
-            )
+        _check_once(f"{type(policy).__name__} evaluated its model", len(calls))
 
     def sample(
         self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Any:
-        """The sampler's argument."""
-        if kwargs.get("noise") is not None:
-            raise ValueError(
-                "the prior gives noise=: leave it out, and put no second prior around a "
-                "policy that has one (warm_smolvla, warm_pi05)"
-            )
+        """Pass the source to the sampler as an argument."""
+        check_no_noise(kwargs)
         image = args[0][0]
         shape = torch.Size((len(image), self.length(policy), self.width(policy)))
         return sample(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
 
     def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
-        """These families integrate from 1, the source, to 0: velocities have the other sign."""
+        """Guide velocities of the other sign: these families integrate from 1, the source, to 0."""
         rtc = getattr(policy.config, "rtc_config", None)
         if rtc is not None and rtc.enabled:
             raise ValueError("the policy's own rtc_config guides already: turn it off, or leave out guidance")
@@ -254,11 +244,10 @@ class GrootPort(FlowPort):
     """For GR00T N1.7."""
 
     def check(self, policy: Any) -> None:
-        """Of relative actions."""
+        """Raise ValueError for relative actions, which cannot be expressed at the next state from outside."""
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError(
-                "GR00T's own relative actions (use_relative_actions=True) cannot be expressed at the next "
-                "state from outside: train with absolute actions"
+                "GR00T's use_relative_actions=True is not supported: train with absolute actions"
             )
 
 
@@ -266,22 +255,18 @@ class GrootN15Port(FlowPort):
     """For GR00T N1.5, which deviates from its configuration."""
 
     def check(self, policy: Any) -> None:
-        """Of copies of the batch."""
+        """Raise ValueError if the action head repeats each batch before it draws noise."""
         copies = policy._groot_model.action_head.config.expand_batch
         if copies not in (None, 1):
-            raise ValueError(
-                f"the action head repeats each batch {copies} times before it draws noise "
-                f"(expand_batch={copies}), and the history is not repeated with it: set it to None, and take "
-                "a larger batch"
-            )
+            raise ValueError(f"expand_batch={copies} does not repeat the history: set it to None")
 
     def normalization(self, policy: Any) -> str:
-        """Its preprocessor takes minima and maxima, whatever its ``normalization_mapping``."""
+        """Return what its preprocessor does, whatever its ``normalization_mapping``."""
         return "MIN_MAX"
 
     @contextmanager
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """``select_action`` executes the first actions of a chunk."""
+        """Let ``select_action`` execute the first actions of a chunk."""
 
         def predicted(predict: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
             # Its queue takes the whole chunk and keeps the last n_action_steps actions.
@@ -298,23 +283,20 @@ class MultiTaskDiTPort(FlowPort):
     """For multi_task_dit, whose chunk begins with the first of its observations."""
 
     def lead(self, policy: Any) -> int:
-        """Observations before the last one."""
+        """Return the number of observations before the last one."""
         return policy.config.n_obs_steps - 1
 
     def check(self, policy: Any) -> None:
-        """Of its objective."""
+        """Raise ValueError unless its objective is flow matching."""
         if policy.config.objective != "flow_matching":
-            raise ValueError(
-                f"multi_task_dit with objective={policy.config.objective!r} is no flow: set "
-                "objective='flow_matching'"
-            )
+            raise ValueError(f"objective={policy.config.objective!r} is no flow: set 'flow_matching'")
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
-        """Its own ``predict_action_chunk`` takes the observations from its queue."""
+        """Sample a chunk; its own ``predict_action_chunk`` takes the observations from its queue."""
         policy.eval()
         if policy.config.n_obs_steps == 1:  # the queue adds a time dimension even to a single one
-            seen = policy.config.input_features
-            batch = {name: v.unsqueeze(1) if name in seen else v for name, v in batch.items()}
+            inputs = policy.config.input_features
+            batch = {name: v.unsqueeze(1) if name in inputs else v for name, v in batch.items()}
         with torch.no_grad():
             policy._generate_actions(policy._prepare_batch(batch))
 
@@ -359,21 +341,16 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed."""
+    """Return the port of a policy's family, or of a subclass, in the release of lerobot that is installed."""
     installed = version("lerobot")
-    ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)
-    supported = "; ".join(f"{release}: {', '.join(known)}" for release, known in PORTS.items())
+    ports = next((PORTS[release] for release in PORTS if f"{installed}.".startswith(f"{release}.")), None)
+    supported = "; ".join(f"{release}: {', '.join(families)}" for release, families in PORTS.items())
     if ports is None:
-        raise ImportError(
-            f"lerobot {installed} is installed, and its policies may draw their noise elsewhere: "
-            f"supported are, by release, {supported}"
-        )
+        raise ImportError(f"lerobot {installed} is not supported; by release supported are {supported}")
     names = [getattr(kind, "name", None) for kind in type(policy).__mro__]
     port = next((ports[name] for name in names if name in ports), None)
     if port is None:
-        raise ValueError(
-            f"{type(policy).__name__} of lerobot {installed} is not supported: supported are, by release, "
-            f"{supported}"
-        )
+        policy_name = f"{type(policy).__name__} of lerobot {installed}"
+        raise ValueError(f"{policy_name} is not supported; by release supported are {supported}")
     port.check(policy)
     return port

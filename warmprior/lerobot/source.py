@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from warmprior.history import check_history, cold_history, window_history, without
 from warmprior.lerobot.ports import port_for
+from warmprior.modules.checks import check_positive, check_shape
 from warmprior.modules.prior import Prior, Source
 
 
@@ -30,10 +31,9 @@ class ChunkSource:
         self.prior, self._std = prior, std
         room = self.length - self.lead
         if prior.prediction_length > room:
+            most = room // prior.prediction_chunks
             raise ValueError(
-                f"{prior} predicts {prior.prediction_length} actions, but the policy's chunks have {room} "
-                f"from the current step on: use chunk_length <= "
-                f"{room // prior.prediction_chunks}, or a policy with longer chunks"
+                f"{prior} is longer than the {room} actions of the policy: chunk_length <= {most}"
             )
         weights = prior.parameters() if isinstance(prior, nn.Module) else ()
         device = next((weight.device for weight in weights), None)
@@ -41,17 +41,11 @@ class ChunkSource:
         try:
             prior.distribution(cold_history([1], *self._lengths, self.action_dim, device=device))
         except Exception as error:
-            raise ValueError(
-                f"{prior} cannot be the source of a policy of LeRobot, where it gets the history and no "
-                f"observation: {error}"
-            ) from error
-        if std is not None and not (
-            tuple(std.shape) == (self.action_dim,) and (std > 0).all() and std.isfinite().all()
-        ):
-            raise ValueError(
-                f"the standard deviation of the actions must be {self.action_dim} finite numbers > 0, one "
-                f"per dimension, got {std.tolist()}"
-            )
+            raise ValueError(f"{prior} needs more than the history, which LeRobot has: {error}") from error
+        if std is not None:
+            check_shape("std", std, (self.action_dim,))
+            for value in std.tolist():
+                check_positive(std=value)
 
     @property
     def positions(self) -> slice:
@@ -136,26 +130,21 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
         "QUANTILE10": ("std", "q10", "q90"),
     }
     if mode not in needs:
+        name = type(policy).__name__
         raise ValueError(
-            f"{type(policy).__name__} normalises actions by its own means ({mode}): give their standard "
-            "deviation in the model's units as std (the plugin's --policy.action_std), or leave it out"
+            f"{name} normalises actions by its own means ({mode}): give std in the model's units"
         )
-    missing = [name for name in needs[mode] if name not in own]
-    if missing:
+    if missing := [name for name in needs[mode] if name not in own]:
         raise ValueError(
-            f"the standard deviation needs the statistics {', '.join(missing)} of 'action' for {mode} "
-            "normalisation: give dataset.meta.stats"
+            f"{mode} needs the statistics {', '.join(missing)} of 'action', as in dataset.meta.stats"
         )
     std, *bounds = (torch.as_tensor(own[name], dtype=torch.float32) for name in needs[mode])
     if mode == "MEAN_STD":
         return torch.ones_like(std)
     low, high = bounds
     unit = 2 * std / (high - low)
-    still = [i for i, value in enumerate(unit.tolist()) if not 0 < value < math.inf]
-    if still:
+    if still := [i for i, value in enumerate(unit.tolist()) if not 0 < value < math.inf]:
         raise ValueError(
-            f"units of the standard deviation need actions that vary: dimensions {still} have std "
-            f"{std[still].tolist()} between {needs[mode][1]} {low[still].tolist()} and {needs[mode][2]} "
-            f"{high[still].tolist()}. Give std in the model's units, or leave it out"
+            f"actions {still} do not vary: std {std[still].tolist()}; give std in the model's units"
         )
     return unit
