@@ -74,9 +74,9 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
 
 def test_bad_options_and_policies_are_named():
     field = policy(lambda t, a, o: -a)
-    with pytest.raises(ValueError, match="n_steps >= 2"):
+    with pytest.raises(ValueError, match=r"n_steps must be .*at least 2, got 1"):
         curvature(field, batch(), 1)
-    with pytest.raises(ValueError, match="no path of 100 steps"):
+    with pytest.raises(ValueError, match=r"at most 1 .*not 100"):
         curvature(policy(lambda t, a, o: -a, max_nfe=1), batch())
 
     def explodes(t, a, o):

@@ -14,6 +14,7 @@ from warmprior.diagnostics.flow import (
     SPLIT,
     RunningVariance,
     check_flow,
+    check_not_empty,
     evaluation_mode,
     flat_windows,
 )
@@ -139,8 +140,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         (8.0, 0.5)
     """
     check_keys(batch, (keys.CHUNK, keys.HISTORY), "branching_bound")
-    if batch.batch_size.numel() == 0:
-        raise ValueError("the batch holds no window")
+    check_not_empty(batch)
     with torch.no_grad():
         source = prior.distribution(batch.get(keys.HISTORY), batch.get(keys.OBSERVATION, None))
     if type(source) is not Source:
@@ -227,9 +227,9 @@ def curvature(
         >>> curvature(actor, batch)["kappa"].shape
         torch.Size([5])
     """
-    check_flow(policy, max(n_steps, 2))
-    if draws < 1 or n_steps < 2:
-        raise ValueError(f"need n_steps >= 2 and draws >= 1, got {n_steps} and {draws}")
+    check_whole_numbers(2, n_steps=n_steps)
+    check_whole_numbers(draws=draws)
+    check_flow(policy, n_steps)
     windows = flat_windows(policy, batch)
     rows = windows.repeat(draws)
     parts = []
@@ -243,9 +243,9 @@ def curvature(
     deviations, mean, gap = (torch.cat(part) for part in zip(*parts, strict=True))
     bad = ~torch.isfinite(deviations).flatten(1).all(1)
     if bad.any():
+        row = int(bad.nonzero()[0]) % len(windows)
         raise FloatingPointError(
-            f"{int(bad.sum())} of {len(rows)} paths became NaN or infinite, the first that of "
-            f"observation {int(bad.nonzero()[0]) % len(windows)}"
+            f"{int(bad.sum())} of {len(rows)} paths are NaN or infinite: observation {row}"
         )
     out = TensorDict({}, batch_size=windows.shape, device=a0.device)
     for suffix, end in (("", policy.prior.prediction_length), ("_executed", policy.prior.chunk_length)):

@@ -116,8 +116,8 @@ def mean_error(
     with evaluation_mode(policy):
         nfe = policy.ode.nfe if nfe is None else nfe
         chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
-    mean, known = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
-    return MeanError(_rms((mean - target)[known]), _rms((mean - chunk)[known]))
+    mean, warm = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
+    return MeanError(_rms((mean - target)[warm]), _rms((mean - chunk)[warm]))
 
 
 def mean_revision(rollout: TensorDictBase) -> float:
@@ -160,7 +160,7 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
     r"""Share of the target's coordinates inside the central interval of a Gaussian source.
 
     A calibrated source covers ``level``. One that covers less trusts its mean too much; one that covers
-    everything is too wide, as N(0, I) is around normalised actions.
+    everything is too wide, as N(0, I) is for normalised actions.
 
     Args:
         policy: the policy, whose prior gives the source (:meth:`Prior.distribution`).

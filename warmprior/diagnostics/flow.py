@@ -14,7 +14,14 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positions
+from warmprior.modules.checks import (
+    check_between,
+    check_finite,
+    check_finite_steps,
+    check_keys,
+    check_positions,
+    check_whole_numbers,
+)
 from warmprior.modules.network import encoded
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation
@@ -53,19 +60,11 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
     """Check a batch and bring it into shape; a ``KeyError`` or ``ValueError`` says what is wrong with it."""
     observation_key = policy.in_keys[0]
     needed = [*policy.in_keys, *([keys.CHUNK] if target_needed else [])]
-    missing = [key for key in needed if batch.get(key, None) is None]
-    if missing:
-        bare = "" if policy.ode.guidance is None else ", or measure policy.replace(guidance=None)"
-        raise KeyError(
-            f"the batch lacks {missing}; sample windows from window_replay_buffer, or take a rollout{bare}"
-        )
-    if batch.batch_size.numel() == 0:
-        raise ValueError("the batch holds no observation")
+    bare = "" if policy.ode.guidance is None else "; or measure policy.replace(guidance=None)"
+    check_keys(batch, needed, "a batch of windows, or a rollout,", bare)
+    check_not_empty(batch)
     if isinstance(batch.get(observation_key), TensorDictBase):
-        raise ValueError(
-            f"{observation_key!r} has several entries, and diagnostics take vectors: pass "
-            "encoded_windows(policy, windows)"
-        )
+        raise ValueError(f"{observation_key!r} is not a vector: pass encoded_windows(policy, windows)")
     device = next(policy.parameters()).device
     prior, ndim = policy.prior, batch.ndim
 
@@ -85,12 +84,18 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
         keys.FORECAST: history["forecast"],
     }
     for key, value in entries.items():
-        if value is not None and not torch.isfinite(value).all():
-            raise ValueError(f"{key} holds NaN or Inf")
+        if value is not None:
+            check_finite_steps(key, value)
     with torch.no_grad():
         loc, _, warm = prior.distribution(history, observation)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
     return Windows(batch.batch_size, observation, history, loc, warm, counted, target)
+
+
+def check_not_empty(batch: TensorDictBase) -> None:
+    """Raise ValueError if a batch has no elements."""
+    if batch.batch_size.numel() == 0:
+        raise ValueError(f"the batch has shape {list(batch.batch_size)}: it holds no observation")
 
 
 def judged(
@@ -145,8 +150,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
     observation = windows.get(key, None)
     if not isinstance(observation, TensorDictBase):
         return windows
-    if windows.batch_size.numel() == 0:
-        raise ValueError("the batch holds no observation")
+    check_not_empty(windows)
     device = next(policy.parameters()).device
     with evaluation_mode(policy):
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
@@ -175,13 +179,10 @@ def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
     """A ``ValueError`` if the field is not trained along a whole path of ``steps`` network evaluations."""
-    if steps < 1:
-        raise ValueError(f"a path needs at least 1 step, got {steps}")
+    check_whole_numbers(n_steps=steps)
     most = policy.ode.max_nfe
     if most is not None and steps > most:
-        raise ValueError(
-            f"the policy is trained for at most {most} network evaluation(s): it has no path of {steps} steps"
-        )
+        raise ValueError(f"the policy is trained for at most {most} network evaluation(s), not {steps}")
 
 
 @contextmanager
@@ -203,8 +204,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     allowed = sorted({nfe for nfe in nfes if most is None or nfe <= most})
     if not allowed:
         raise ValueError(
-            f"the policy is trained for at most {most} network evaluation(s), and {list(nfes)} has none: "
-            f"add NFE {most}"
+            f"the policy is trained for at most NFE {most}, and {list(nfes)} has none: add {most}"
         )
     for nfe in allowed:
         policy.ode.check_nfe(nfe)
@@ -215,8 +215,7 @@ def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, nfe: int) 
     """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources; all finite."""
     parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(SPLIT)
     chunk = torch.cat([policy.integrate(part, nfe).get(keys.CHUNK) for part in parts])
-    if not torch.isfinite(chunk).all():
-        raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
+    check_finite({f"a prediction at NFE {nfe}": chunk}, "the policy cannot be measured")
     return chunk
 
 
@@ -299,19 +298,14 @@ class SharedObservations:
     ) -> None:
         self.data, self.chunk_length = data, chunk_length
         self.observation_steps = observation_steps
-        episode = data.get(keys.EPISODE, None)
-        if episode is None:
-            raise KeyError(f"the data lack {keys.EPISODE!r}, the number of each step's episode")
-        episode = episode.flatten().cpu()
+        check_keys(data, [keys.EPISODE], "SharedObservations")
+        episode = data.get(keys.EPISODE).flatten().cpu()
         first = torch.arange(len(episode)) - chunk_length
         frames = ((first >= 0) & (episode[first.clamp_min(0)] == episode)).nonzero().flatten()
         if count is not None:
             if not 1 <= count <= len(frames):
-                raise ValueError(
-                    f"{count} observations are asked for, but {len(frames)} of {len(episode)} steps "
-                    f"have {chunk_length} earlier ones in their episode: give more demonstrations, or "
-                    "ask for fewer observations"
-                )
+                have = f"{len(frames)} of {len(episode)} steps have {chunk_length} before them"
+                raise ValueError(f"count={count} observations, but {have} in their episode")
             frames = frames[torch.randperm(len(frames), generator=generator)[:count]].sort()[0]
         self.frames = frames
         self.episodes = episode[frames]
@@ -325,13 +319,10 @@ class SharedObservations:
         Of the prior only the lengths matter. ``see_history`` tells whether a network sees the last actions. A
         ``ValueError`` if the prior has another chunk length.
         """
-        if not 0 <= offset <= self.chunk_length:
-            raise ValueError(f"offset must be between 0 and {self.chunk_length}, got {offset}")
+        check_between(0, self.chunk_length, offset=offset)
         if prior.chunk_length != self.chunk_length:
-            raise ValueError(
-                f"compare policies of one chunk length: these observations have H = {self.chunk_length}, "
-                f"{prior} has {prior.chunk_length}"
-            )
+            own = f"of one chunk length: {self.chunk_length}"
+            raise ValueError(f"compare policies {own}, but {prior} has {prior.chunk_length}")
         window = window_transforms(
             self.data, prior, observation_steps=self.observation_steps, see_history=see_history
         )

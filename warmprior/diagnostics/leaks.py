@@ -26,7 +26,7 @@ from warmprior.diagnostics.flow import (
     sees_history,
 )
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positive
+from warmprior.modules.checks import check_positive, check_shape, check_whole_numbers
 
 LEAK_BOUND = 1.0
 """Largest leak of a sampler that spreads like the data; a larger one adds noise."""
@@ -144,16 +144,14 @@ def source_leak(
         >>> leak.inner_step_ratio > 2, leak.warning is None  # noise, to smooth demonstrations
         (True, False)
     """
-    if draws < 2:
-        raise ValueError(f"need draws >= 2, got {draws}")
+    check_whole_numbers(2, draws=draws)
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat, target, rows, generator = judged(policy, windows)
     n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
     episodes = torch.arange(n) if episodes is None else episodes.flatten()
-    if len(episodes) != n:
-        raise ValueError(f"each of the {n} windows needs its episode, got {len(episodes)}")
+    check_shape("episodes of the windows", episodes, (n,))
     if len(episodes.unique()) < 2:
         raise ValueError("each window is compared with one of another episode, and all are of one")
     target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
@@ -320,10 +318,7 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
     if isinstance(given, TensorDictBase):
         given, made = given.get(keys.STATE), made.get(keys.STATE)
     if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
-        raise ValueError(
-            f"{key!r} does not end in the windows' last actions, as HistoryObservation writes them: pass "
-            "windows with images as they are, not encoded"
-        )
+        raise ValueError(f"{key!r} does not end in the windows' last actions: do not encode images before")
 
 
 class HistoryShift(TensorDictModuleBase):
@@ -374,7 +369,7 @@ class HistoryShift(TensorDictModuleBase):
             dtype=actions.dtype,
             device=actions.device,
         )
-        seen = tensordict.clone(recurse=False)
-        seen.set(keys.HISTORY, shifted(history, self.std * noise))
-        out = self.policy(seen_anew(self.policy, seen))
+        disturbed = tensordict.clone(recurse=False)
+        disturbed.set(keys.HISTORY, shifted(history, self.std * noise))
+        out = self.policy(seen_anew(self.policy, disturbed))
         return tensordict.update(out.select(*self.out_keys))

@@ -84,10 +84,8 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
     """
     description: Any = actor.environment
     if not _is_complete(description):
-        raise ValueError(
-            f"the policy keeps no description of a robosuite environment, but {description}: build the "
-            "environment yourself, with policy_transforms(actor)"
-        )
+        what = f"no description of a robosuite environment, but {description}"
+        raise ValueError(f"the policy keeps {what}: build yours with policy_transforms(actor)")
     make_env, adapters = robosuite_parts(description)
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(
@@ -118,7 +116,7 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
         Traceback (most recent call last):
             ...
-        ValueError: the policy keeps no description of a robosuite environment, but None: build the ...
+        ValueError: the policy keeps no description of a robosuite environment, but None: build ...
     """
     make_env, make_transforms = environment_parts(actor)
     return TransformedEnv(make_env(**options), make_transforms())
