@@ -137,28 +137,28 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
 class LeRobotDemonstrations(DemonstrationReplay):
     """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
-    The counterpart of :class:`RobomimicDemonstrations`, with the same entries and properties.
-    :class:`~warmprior.ActionWindow` makes windows, whose history and padding are those of
-    ``delta_timestamps``, but that what lies outside an episode is masked and zero where LeRobot repeats its
-    first action, which is part of the target.
+    It has the entries and properties of :class:`RobomimicDemonstrations`. Windows of
+    :class:`~warmprior.ActionWindow` equal those of ``delta_timestamps``, except before an episode's start:
+    LeRobot repeats the first action, which is part of the target; here the history is masked and zero.
 
-    Of images only those that ``image_keys`` names are fetched and decoded, once and by LeRobot's own decoder,
-    and of the selected episodes alone. Without ``next.reward`` the rewards are ``next.success``, or zeros.
+    Only images that ``image_keys`` names are fetched and decoded, once and by LeRobot's own decoder, and only
+    those of the selected episodes. Without ``next.reward`` the rewards are ``next.success``, or zeros.
 
     Args:
         dataset: the dataset's folder, or its repository in the hub (``"user/name"``).
         revision: branch, tag or commit of a repository.
-        env_args: of the environment in which it was recorded
+        env_args: describes the environment in which it was recorded
             (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
-            did not write; those are refused if it names another. Frequency, widths and names are checked
-            against it, and robomimic's observations found by it. Without, whole features are observations.
-        observation_keys: observations to concatenate; by default those of the task, or of an unknown
-            environment ``"observation.environment_state"`` and ``"observation.state"`` as far as there.
+            did not write; a converted one has to name the same environment. Frequency, widths and names are
+            checked against it, and it tells where robomimic's observations are. Without it, whole features
+            are observations.
+        observation_keys: observations to concatenate; by default those of the task, or for an unknown
+            environment ``"observation.environment_state"`` and ``"observation.state"``, if present.
         image_keys: images to read as well: ``"agentview_image"`` is the feature
             ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
             are many.
-        filter_key: a mask of the converted file. It, ``demos``, ``absolute_actions`` and ``**kwargs`` are as
-            of :class:`RobomimicDemonstrations`.
+        filter_key: a mask of the converted file; for this, ``demos``, ``absolute_actions`` and ``**kwargs``
+            see :class:`RobomimicDemonstrations`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.

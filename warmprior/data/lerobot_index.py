@@ -268,7 +268,7 @@ def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], wh
 
 
 def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None) -> None:
-    """Whether the actions are those of an environment, one per control step."""
+    """Raise DatasetError unless the actions are those of an environment, one per control step."""
     name, control = env_args["env_name"], env_args["env_kwargs"].get("control_freq", 20)
     if metadata.fps != control:
         raise DatasetError(f"{root}: fps is {metadata.fps}, but {name} runs at {control} Hz: resample it")
@@ -287,17 +287,17 @@ def _named_columns(
     described: Mapping[str, Any],
     task: TaskSpec | None,
 ) -> dict[str, tuple[str, slice]]:
-    """Where robomimic's observations are."""
+    """Return the feature that holds each of robomimic's observations, and its columns there."""
     vectors = {name: width for name, width in widths.items() if name.startswith("observation.")}
     if described:
-        found = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
+        places = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
         needed = {} if task is None else task.low_dim_widths
-        for key, (name, part) in found.items():
+        for key, (name, part) in places.items():
             width = needed.get(key, part.stop - part.start)
             if not 0 <= part.start < part.stop == part.start + width <= vectors.get(name, 0):
                 what = f"observations[{key!r}], columns {part.start} to {part.stop} of {name},"
                 raise DatasetError(f"{root / DESCRIPTION}: {what} do not fit: convert the file again")
-        return found
+        return places
     if task is None:
         return {}
     layouts: list[dict[str, dict[str, int]]] = [
@@ -315,14 +315,14 @@ def _named_columns(
             f"{' or '.join(map(str, reversed(sums)))}: choose another task or dataset"
         )
     layout = layouts[fits.index(True)]
-    found = {}
+    columns: dict[str, tuple[str, slice]] = {}
     for name, parts in layout.items():
         if name in (ENVIRONMENT_STATE, ROBOT_STATE):
             what = f"the numbers of {name} in {task.env_name} are"
             _check_names(root, features[name], state_names(parts), what)
         ends = pairwise(accumulate(parts.values(), initial=0))
-        found |= {key: (name, slice(*end)) for key, end in zip(parts, ends, strict=True)}
-    return {key: found[key] for key in task.low_dim_widths}
+        columns |= {key: (name, slice(*end)) for key, end in zip(parts, ends, strict=True)}
+    return {key: columns[key] for key in task.low_dim_widths}
 
 
 def _image_size(

@@ -116,9 +116,9 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
             raise DatasetError(f"{path}: there are {available} demonstrations, fewer than demos={demos}")
 
 
-def unknown(where: Any, kind: str, name: str, known: Iterable[str]) -> DatasetError:
-    """Return the error that says which things of a kind there are, where one of another name is needed."""
-    return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(known) or 'none'}")
+def unknown(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetError:
+    """Return the error for a name that is not among those of its kind."""
+    return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(names) or 'none'}")
 
 
 def common_size(path: Path, sides: Mapping[int, str]) -> int:

@@ -72,10 +72,10 @@ class Arm:
     def remembered(
         self, jacp: np.ndarray, jacr: np.ndarray, mass: np.ndarray, qvel: np.ndarray, qpos: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """The pose of the grip site, and joints' velocities and positions, as measured during the reset.
+        """Return the pose of the grip site, and the joints' velocities and positions, measured at the reset.
 
-        robosuite computes the first torques of an episode from these, although the joints have been put in
-        place since; so does this loop.
+        This reproduces that robosuite computes an episode's first torques from these, although it has moved
+        the joints since.
         """
         controller = self.controller
         positions, columns = self.constants[:2]

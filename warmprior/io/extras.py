@@ -20,9 +20,9 @@ def require(module: str, extra: str) -> ModuleType:
         ImportError: no_such_module is not installed; run: pip install 'warmprior[sim]'
     """
     try:
-        found = importlib.util.find_spec(module) is not None
+        spec = importlib.util.find_spec(module)
     except ModuleNotFoundError:  # a parent package is missing
-        found = False
-    if not found:
+        spec = None
+    if spec is None:
         raise ImportError(f"{module} is not installed; run: pip install 'warmprior[{extra}]'")
     return importlib.import_module(module)
