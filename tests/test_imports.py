@@ -1,8 +1,9 @@
-"""The package needs torch, tensordict and torchrl, and nothing that is optional."""
+"""What the package may import, and what it may not contain: command lines, prints, benchmarks."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -89,3 +90,72 @@ def test_imports_point_one_way_and_name_nothing_private():
             if place[1:2] != [room]:
                 private = [n for n in (*place, *names) if n.startswith("_") and n != "__main__"]
                 assert not private, f"{path} imports {private}"
+
+
+PACKAGE = Path(warmprior.__file__).parent
+BENCHMARKS = PACKAGE.parent / "benchmarks"
+FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+COMMAND_LINES = ("__main__.py", "io/script.py")
+"""The package's own command line, and what reports the errors of any."""
+
+
+def sources():
+    """Every file of the package, by where it is in it."""
+    return {path.relative_to(PACKAGE).as_posix(): path.read_text() for path in PACKAGE.rglob("*.py")}
+
+
+def test_the_package_names_no_option_of_a_command_line():
+    found = [
+        f"{name}:{number}: {line.strip()}"
+        for name, text in sources().items()
+        for number, line in enumerate(text.splitlines(), 1)
+        if name != "__main__.py" and FLAG.search(line) and "pip install" not in line  # pip's own are fine
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_the_package_prints_nothing():
+    calls = [
+        (name, node.lineno)
+        for name, text in sources().items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
+    ]
+    assert not [call for call in calls if call[0] not in COMMAND_LINES]
+    assert {name for name, _ in calls} == set(COMMAND_LINES)
+
+
+def test_the_package_knows_no_benchmark():
+    for path in PACKAGE.rglob("*.py"):
+        roots = {module.split(".")[0] for module, _ in imported(path)}
+        assert not roots & {"lab", "benchmarks", *(script.stem for script in BENCHMARKS.glob("*.py"))}, path
+
+
+# TorchRL imports simulators itself where they are installed.
+LOADED = """
+import sys
+import torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.record
+before = set(sys.modules)
+import warmprior.training
+print(*sorted(set(sys.modules) - before))
+"""
+
+
+def test_training_loads_neither_simulator_nor_renderer_nor_experts():
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED], capture_output=True, text=True, timeout=120, check=True
+    )
+    new = set(done.stdout.split())
+    assert "warmprior.training.train" in new
+    heavy = {"robosuite", "mujoco", "OpenGL", "numba", "h5py", "lerobot", "loky", "matplotlib", "tyro"}
+    assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
+    rooms = {".".join(name.split(".")[:2]) for name in new}
+    assert not rooms & {"warmprior.envs", "warmprior.data", "warmprior.lerobot", "warmprior.deploy"}
+
+
+def test_scripts_find_the_lab_by_themselves_and_its_files_say_what_they_hold():
+    for path in BENCHMARKS.glob("*.py"):
+        assert "sys.path" not in path.read_text(), path
+    for path in BENCHMARKS.glob("lab/**/*.py"):
+        first, *_ = ast.get_docstring(ast.parse(path.read_text())).splitlines()
+        assert first.endswith("."), path

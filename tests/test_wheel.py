@@ -14,9 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.data.synthetic import write_robomimic_file
 from warmprior.training.saved import FORMAT
 
 ROOT = Path(__file__).parents[1]
+PLUGIN = ROOT / "plugins" / "lerobot_policy_warmprior"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NAME = f"warmprior-{PROJECT['version']}"
 
@@ -26,9 +28,12 @@ pytestmark = pytest.mark.slow
 def run(*command, cwd):
     """Run a command as if this process had not prepared anything for it."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return subprocess.run(
-        list(map(str, command)), cwd=cwd, env=clean, check=True, capture_output=True, text=True
-    ).stdout
+    clean["HF_HUB_OFFLINE"] = "1"
+    done = subprocess.run(
+        list(map(str, command)), cwd=cwd, env=clean, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
 
 
 def build(source, out, *targets):
@@ -45,14 +50,18 @@ def built(tmp_path_factory):
     return out / f"{NAME}-py3-none-any.whl", out / f"{NAME}.tar.gz"
 
 
+def install(python, wheel):
+    options = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
+    run(sys.executable, "-m", "pip", "--python", python, "install", *options, wheel, cwd=wheel.parent)
+
+
 @pytest.fixture(scope="module")
 def python(built, tmp_path_factory):
     """The interpreter of an environment that has the wheel; what it depends on is lent to it."""
     place = tmp_path_factory.mktemp("empty")
     venv.create(place, with_pip=False)
     python = place / "bin" / "python"
-    options = ("--quiet", "--no-deps", "--no-index", "--disable-pip-version-check")
-    run(sys.executable, "-m", "pip", "--python", python, "install", *options, built[0], cwd=place)
+    install(python, built[0])
     (own,) = place.glob("lib/python*/site-packages")
     # Plain paths: the .pth files in these folders, such as this checkout's, are not read.
     lent = [path for path in sys.path if path.endswith("site-packages")]
@@ -77,11 +86,14 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
     with tarfile.open(built[1]) as archive:
         names = {name.removeprefix(f"{NAME}/") for name in archive.getnames()}
         archive.extractall(tmp_path, filter="data")
+    built_here = re.compile(r"__pycache__|^docs/(_build|auto_tutorials|reference/api)/|^runs/|\.venv")
     wanted = "pyproject.toml README.md CHANGELOG.md LICENSE CITATION.cff CONTRIBUTING.md Makefile"
     assert set(wanted.split()) <= names
     assert {"constraints.txt", "docs/conf.py", "tests/conftest.py"} <= names
-    assert {f"benchmarks/{path.name}" for path in ROOT.glob("benchmarks/*.py")} <= names
-    built_here = re.compile(r"__pycache__|^docs/_build/|^docs/reference/api/|^runs/|\.venv")
+    assert {"benchmarks/lab/options.py", "benchmarks/lab/scripted/tasks.py", "tests/lab/__init__.py"} <= names
+    for folder in ("benchmarks", "docs", "tests", "plugins"):
+        files = {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*.py")}
+        assert {name for name in files if not built_here.search(name)} <= names
     assert not [name for name in names if built_here.search(name)]
     build(tmp_path / NAME, tmp_path, "wheel")
     with zipfile.ZipFile(built[0]) as mine, zipfile.ZipFile(tmp_path / built[0].name) as again:
@@ -103,8 +115,49 @@ def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(pytho
     assert f"warmprior {PROJECT['version']}, format {FORMAT}" in printed
 
 
+def test_a_simulated_policy_trains_and_plays_with_the_wheel_alone(python, tmp_path):
+    pytest.importorskip("robosuite")
+    write_robomimic_file(tmp_path / "lift.hdf5", lengths=(30, 40), task="lift")
+    words = "train --dataset lift.hdf5 --iterations 3 --batch-size 8 --checkpoints 1 --hidden-dim 16"
+    trained = run(python, "-m", "warmprior", *words.split(), cwd=tmp_path).splitlines()[-1]
+    printed = run(
+        python, "-m", "warmprior", "evaluate", trained, *["--episodes", "1", "--nfe", "1"], cwd=tmp_path
+    )
+    assert re.search(r"^[01] of 1 episodes solved", printed, re.M)
+
+
+WHERE = """
+import lerobot_policy_warmprior as plugin, warmprior
+from importlib.util import find_spec
+print(warmprior.__file__, plugin.__file__, find_spec("lab"), find_spec("benchmarks"))
+"""
+TRAIN = """--policy.type=warm_flow --policy.prior=past,sigma=0.3 --policy.embedding_dim=24
+--policy.num_layers=1 --policy.device=cpu --policy.push_to_hub=false --steps=2 --batch_size=4
+--num_workers=0 --save_freq=2 --dataset.root=data --dataset.repo_id=local/tiny --output_dir=run"""
+EVALUATE = """--policy.path=run/checkpoints/last/pretrained_model --policy.device=cpu
+--eval.n_episodes=1 --eval.batch_size=1 --env.type=warmprior_robosuite --env.task=lift
+--env.episode_length=20 --output_dir=evaluation"""
+
+
+def test_the_plugin_trains_and_plays_with_the_wheels_alone(python, tmp_path):
+    for package in ("lerobot", "accelerate", "robosuite"):
+        pytest.importorskip(package)
+    from tests.data.lerobot_parts import write_lerobot
+
+    build(PLUGIN, tmp_path / "dist", "wheel")
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    install(python, wheel)
+    *files, lab, benchmarks = run(python, "-c", WHERE, cwd=tmp_path).split()
+    assert all(Path(file).is_relative_to(python.parents[1]) for file in files)
+    assert lab == benchmarks == "None"
+    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
+    run(python, "-m", "lerobot.scripts.lerobot_train", *TRAIN.split(), cwd=tmp_path)
+    run(python, "-m", "lerobot.scripts.lerobot_eval", *EVALUATE.split(), cwd=tmp_path)
+    assert (tmp_path / "evaluation" / "eval_info.json").is_file()
+
+
 def test_the_plugin_and_the_citation_have_the_same_version():
-    plugin = ROOT / "plugins" / "lerobot_policy_warmprior" / "pyproject.toml"
+    plugin = PLUGIN / "pyproject.toml"
     assert tomllib.loads(plugin.read_text())["project"]["version"] == PROJECT["version"]
     assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"## {PROJECT['version']}\n" in (ROOT / "CHANGELOG.md").read_text()
