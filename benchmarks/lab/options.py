@@ -1,6 +1,7 @@
 """The options that all benchmarks share: a dataclass per concern, and how a command line becomes one.
 
-Every option is declared here once, or in the library's `DataOptions`, `NetworkOptions` and `TrainingConfig`.
+Every option is declared once: here, in `DataOptions` (lab/tasks.py), or in the library's `NetworkOptions` and
+`TrainingConfig`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pictures of the benchmarks, from the same rows as their tables."""
+"""How results are drawn: bars, lines, violins and paths, from the same rows as the tables."""
 
 from __future__ import annotations
 

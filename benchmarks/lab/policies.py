@@ -1,4 +1,4 @@
-"""What the benchmarks share: policies, and the jobs that train, measure and play them.
+"""Policies of a comparison: their folders, the jobs that train and play them, and their rows.
 
 A policy lies in a folder named by a digest of everything that determines it, so runs with the same options
 share it. What is measured of it is a row: one JSON object in `results.jsonl`.
