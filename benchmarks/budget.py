@@ -20,7 +20,7 @@ from lab.options import PRESETS, MeasuredOptions, check_given, check_single, par
 from lab.plots import plot_lines
 from lab.policies import policies_of, write_rows
 from lab.report import labelled, per_seed, table, write_report
-from lab.tasks import check_counts
+from lab.tasks import check_counts, title_of
 from warmprior.diagnostics import action_error, encoded_windows
 from warmprior.training import TrainingConfig
 
@@ -65,7 +65,7 @@ def main(argv: list[str] | None) -> None:
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["iterations", "nfe"], ascending=[True, False], kind="stable")
         lines = {"success": "success rate", "action_error": "squared error, held out"}
-        title = policies[0].task().title
+        title = title_of(policies[0].task())
         plot_lines(seeds, out / "budget.png", title, "iterations", lines, scale="log")
         notes = [
             f"Error: on {source}. It favours the average of all good actions, so it grows with NFE where the "

@@ -19,7 +19,6 @@ from lab.plots import plot_flow_paths
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
 from lab.report import labelled, pooled, problem_title, table, text_of, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
-from warmprior.diagnostics.flow import sees_history
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def main(argv: list[str] | None) -> None:
             if str(method) in labels:
                 actor = by_seed[min(by_seed)]
                 generator = torch.Generator(options.run.device).manual_seed(0)
-                windows = few.windows(actor.prior, see_history=sees_history(actor))
+                windows = few.windows(actor.prior, see_history=actor.sees_history)
                 windows = encoded_windows(actor, windows)
                 path = flow_paths(actor, windows, 100, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, 0].cpu()

@@ -65,7 +65,7 @@ class DelayOptions(Options):
                         raise ValueError(f"need execute <= H = {method.chunk_length}")
                     check_delay(delay, execute, length)
                     if cell.guidance is not None:
-                        cell.guidance.check_delay(delay, length - execute)
+                        cell.guidance.check_reach(delay, length - execute)
                 except ValueError as error:
                     raise ValueError(
                         f"--delay {delay} with --execute {execute} and {method.name}, which predicts "

@@ -22,6 +22,7 @@ from lab.paper import paper_success
 from lab.plots import plot_lines
 from lab.policies import policies_of, trained_actors, write_rows
 from lab.report import labelled, per_seed, pooled, table, write_report
+from lab.tasks import title_of
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 
@@ -46,7 +47,7 @@ def main(argv: list[str] | None) -> None:
         actors = trained_actors(policies, options.run.device)
         flow = straightness(actors, observations)
         curvatures = write_rows(out / "curvature.jsonl", flow)
-        title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
+        title = f"{title_of(policies[0].task())}, NFE {options.evaluation.nfe[0]}"
         # A line per source; one that takes no sigma has a single point.
         flow = pooled(curvatures[curvatures["mean"] == "training"])
         flow = flow.assign(relative_bound=flow.bound_executed / (flow.bound_executed.iloc[0] or math.nan))

@@ -21,7 +21,7 @@ PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.
 SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
     "warmprior.data.lerobot_steps": "needs a dataset",
-    "warmprior.modules.imagenet_weights": "downloads them",
+    "warmprior.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
@@ -142,7 +142,8 @@ def test_the_prior_of_your_own_runs():
     history = window_history(
         torch.rand(2, 3, 1), torch.tensor([[0], [3]]), torch.rand(2, 3, 1), chunk_length=3
     )
-    loc, _, warm = scope["LastAction"](3, sigma=0.3).distribution(history)
+    source = scope["LastAction"](3, sigma=0.3).distribution(history)
+    loc, warm = source.loc, source.warm
     assert warm[..., 0].tolist() == [[False] * 3, [True] * 3]
     assert (loc[1] == history["actions"][1, -1]).all()
 

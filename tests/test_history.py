@@ -167,7 +167,7 @@ def equation(prior, robot, decided):
 
 
 def assert_mean(source, prior, expected):
-    loc, scale, warm = source
+    loc, scale, warm = source.loc, source.scale, source.warm
     assert warm.dtype == torch.bool and warm.shape == (prior.prediction_length, 1)
     assert warm.flatten().tolist() == [mean is not None for mean in expected]
     scale = scale.expand_as(loc)

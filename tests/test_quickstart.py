@@ -33,7 +33,7 @@ def test_the_programs_print_what_the_pages_say(tmp_path, monkeypatch, capsys, it
         assert abs(rates[1] - said[1]) <= 10
     assert (tmp_path / "policy" / "model.safetensors").exists()
     exec(compile(parts, "quickstart", "exec"), scope)
-    assert scope["actor"].ode.nfe == 1
+    assert scope["actor"].sampling.nfe == 1
 
 
 def test_the_readme_shows_the_beginning_of_the_quickstart():

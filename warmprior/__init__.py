@@ -8,111 +8,17 @@ name; parts of them need the extra ``warmprior[sim]``.
 
 from importlib.metadata import version
 
-from warmprior.modules import (
-    AdaLNTransformer,
-    BridgeInterpolant,
-    ChiTransformer,
-    GaussianPrior,
-    ImageEncoder,
-    Interpolant,
-    LinearInterpolant,
-    Normalizer,
-    ODEActor,
-    PastPrior,
-    PlainMLP,
-    PoseTrend,
-    PreconditionedNetwork,
-    PreviewPrior,
-    Prior,
-    PriorSampler,
-    RealTimeChunking,
-    RestingAction,
-    Source,
-    SourceMoments,
-    StartPoint,
-    VelocityMLP,
-    VelocityNetwork,
-    VisionNetwork,
-    WarmPriorActor,
-    integrate,
-)
-from warmprior.objectives import FlowMatchingLoss
-from warmprior.rl import (
-    BoxTanhNormal,
-    DSRLNALoss,
-    PriorAnchor,
-    PriorDecoder,
-    PriorSpace,
-    ResidualSampler,
-    make_prior_space_actor,
-    make_prior_space_critic,
-)
-from warmprior.transforms import (
-    AbsoluteActions,
-    ActionHistory,
-    ActionWindow,
-    CameraImages,
-    ChunkStep,
-    EncodeObservation,
-    HistoryObservation,
-    InferenceDelay,
-    ObservationStack,
-    WithheldHistory,
-    policy_transforms,
-    window_replay_buffer,
-    window_transforms,
-)
+from warmprior import modules, objectives, rl, transforms
+from warmprior.modules import *  # noqa: F403
+from warmprior.objectives import *  # noqa: F403
+from warmprior.rl import *  # noqa: F403
+from warmprior.transforms import *  # noqa: F403
 
 __version__ = version("warmprior")
 
-__all__ = [
-    "AbsoluteActions",
-    "ActionHistory",
-    "ActionWindow",
-    "AdaLNTransformer",
-    "BoxTanhNormal",
-    "BridgeInterpolant",
-    "CameraImages",
-    "ChiTransformer",
-    "ChunkStep",
-    "DSRLNALoss",
-    "EncodeObservation",
-    "FlowMatchingLoss",
-    "GaussianPrior",
-    "HistoryObservation",
-    "ImageEncoder",
-    "InferenceDelay",
-    "Interpolant",
-    "LinearInterpolant",
-    "Normalizer",
-    "ODEActor",
-    "ObservationStack",
-    "PastPrior",
-    "PlainMLP",
-    "PoseTrend",
-    "PreconditionedNetwork",
-    "PreviewPrior",
-    "Prior",
-    "PriorAnchor",
-    "PriorDecoder",
-    "PriorSampler",
-    "PriorSpace",
-    "RealTimeChunking",
-    "ResidualSampler",
-    "RestingAction",
-    "Source",
-    "SourceMoments",
-    "StartPoint",
-    "VelocityMLP",
-    "VelocityNetwork",
-    "VisionNetwork",
-    "WarmPriorActor",
-    "WithheldHistory",
-    "__version__",
-    "integrate",
-    "make_prior_space_actor",
-    "make_prior_space_critic",
-    "policy_transforms",
-    "window_replay_buffer",
-    "window_transforms",
-]
+# A public name is declared once, where it lives.
+__all__ = ["__version__"]
+__all__ += modules.__all__
+__all__ += objectives.__all__
+__all__ += rl.__all__
+__all__ += transforms.__all__

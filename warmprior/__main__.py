@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.modules.option_text import make
+from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 
@@ -58,8 +58,7 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
     actor = _policy(args)
-    nfe = actor.ode.nfe if args.nfe is None else args.nfe
-    actor.ode.check_nfe(nfe)
+    nfe = actor.sampling.evaluations(args.nfe)
     if args.grid is not None:
         actor = actor.replace(grid=args.grid)
     if args.video is not None:  # known now rather than after the episodes

@@ -26,12 +26,27 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import expand_as_right
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 
-__all__ = ["ENTRIES", "advance", "check_history", "cold_history", "window_history", "without"]
+from warmprior import keys
+
+__all__ = [
+    "ENTRIES",
+    "advance",
+    "check_history",
+    "cold_history",
+    "history_keys",
+    "window_history",
+    "without",
+]
 
 ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
+
+
+def history_keys(history_key: NestedKey = keys.HISTORY) -> list[NestedKey]:
+    """Return the keys of a history's entries in a tensordict."""
+    return [unravel_key((history_key, name)) for name in ENTRIES]
 
 
 def cold_history(

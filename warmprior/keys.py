@@ -71,6 +71,7 @@ ACTIONS = ("history", "actions")
 STEPS = ("history", "steps")
 FORECAST = ("history", "forecast")
 FORECAST_STEPS = ("history", "forecast_steps")
+SOURCE = "prior"
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")
 ANCHOR = ("prior", "anchor")

@@ -18,7 +18,6 @@ from lab.options import FinishedRun, Options, check_given, check_single
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors
 from lab.tasks import check_counts, check_network
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
-from warmprior.diagnostics.flow import sees_history
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.rl import PriorSpaceConfig
@@ -160,7 +159,7 @@ def environment(
 ) -> EnvBase:
     """The environment of agents around a frozen policy; the simulator's is in workers."""
     if is_toy:  # nothing but the anchor is random
-        transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
+        transforms = policy_transforms(actor.prior, observation_steps=1, see_history=actor.sees_history)
         transforms.append(PriorAnchor(actor))
         return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
     make_env, make_transforms = environment_parts(actor)

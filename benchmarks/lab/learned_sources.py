@@ -179,10 +179,10 @@ class A2APrior(LearnedPrior):
 class Drawn(Source):
     """A source that is drawn in a way of its own."""
 
-    by: Any = None  # a function of a generator
+    by: Any = None  # a function of a generator and the temperature
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        return self.by(generator)
+    def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> Tensor:
+        return self.by(generator, temperature)
 
 
 class CVAEPrior(LearnedPrior):
@@ -231,12 +231,13 @@ class CVAEPrior(LearnedPrior):
         """One that decodes a latent of its own for every draw: Gaussian given that, and none without."""
         source, seen = super().distribution(history, observation), self.seen(history, observation)
 
-        def decoded(generator: torch.Generator | None) -> Tensor:
+        def decoded(generator: torch.Generator | None, temperature: float) -> Tensor:
             like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
             z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
-            return replace(source, loc=self.decode(seen, z), scale=self.sigma).sample(generator)
+            loc = self.decode(seen, z if temperature == 1.0 else temperature * z)
+            return replace(source, loc=loc, scale=self.sigma).sample(generator, temperature)
 
-        return Drawn(*source, by=decoded)
+        return Drawn(source.loc, source.scale, source.warm, by=decoded)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])

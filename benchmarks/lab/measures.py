@@ -18,11 +18,11 @@ from lab.methods import Method
 from lab.options import MeasuredOptions
 from lab.policies import Policy
 from lab.scripted.generate import generate_demonstrations
+from lab.statistics import bootstrap_ratio
 from lab.tasks import demonstrations_of, read_like
 from warmprior import Prior, WarmPriorActor
 from warmprior.diagnostics import (
     SharedObservations,
-    bootstrap_ratio,
     branching_bound,
     curvature,
     encoded_windows,
@@ -31,7 +31,7 @@ from warmprior.diagnostics import (
     source_coverage,
     source_leak,
 )
-from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
+from warmprior.diagnostics.flow import allowed_nfes, depends_on_history
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
@@ -52,7 +52,7 @@ def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float 
     shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
-    windows = shared.windows(policy.prior, see_history=sees_history(policy))
+    windows = shared.windows(policy.prior, see_history=policy.sees_history)
     seen = encoded_windows(policy, windows)
     leaks: Mapping[int, Any] = {}
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
@@ -61,10 +61,10 @@ def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float 
     met = shared.met(policy, generator=generator)
     allowed = allowed_nfes(policy, nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
-    gains = memory_gain(policy, windows if sees_history(policy) else seen, nfes=nfes)
+    gains = memory_gain(policy, windows if policy.sees_history else seen, nfes=nfes)
     # How straight the flow is between source and targets, over the executed H.
     kappa, relative = math.nan, math.nan
-    if policy.ode.max_nfe is None:
+    if policy.sampling.max_nfe is None:
         with warnings.catch_warnings():  # the NaN says that something does not move
             warnings.simplefilter("ignore")
             values = curvature(policy, met, 100, generator=generator)
@@ -164,7 +164,7 @@ def straightness(
         device = next(actor.parameters()).device
         # Of the earlier prediction: at deployment its noise and that of the next are independent.
         earlier = torch.Generator(device).manual_seed(seed + 1)
-        windows = observations.windows(actor.prior, see_history=sees_history(actor))
+        windows = observations.windows(actor.prior, see_history=actor.sees_history)
         batches = {"training": encoded_windows(actor, windows)}
         if depends_on_history(actor, batches["training"]):
             batches["deployed"] = observations.deployed(actor, generator=earlier)

@@ -55,8 +55,9 @@ class PointPrior(GaussianPrior):
         self.sigma = 0.0
 
     def distribution(self, history: Any, observation: Any = None) -> Source:
-        loc, scale, warm = super().distribution(history, observation)
-        return Drawn(loc, torch.zeros_like(scale), warm, by=lambda generator: loc)
+        source = super().distribution(history, observation)
+        none = torch.zeros_like(source.scale)
+        return Drawn(source.loc, none, source.warm, by=lambda generator, temperature: source.loc)
 
 
 def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:

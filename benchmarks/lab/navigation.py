@@ -12,7 +12,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from warmprior import keys
-from warmprior.diagnostics.flow import sees_history
 from warmprior.diagnostics.leaks import HistoryShift
 from warmprior.diagnostics.smoothness import executed_actions, smoothness
 from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics
@@ -52,7 +51,7 @@ def play_navigation(
         torch.Size([2, 16])
     """
     generator = torch.Generator().manual_seed(seed)
-    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
+    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=actor.sees_history)
     env = TransformedEnv(make_env(batch_size=[rollouts]), transforms)
     player = actor.replace(nfe=nfe, generator=generator)
     policy = HistoryShift(player, shift, generator=generator) if shift else player

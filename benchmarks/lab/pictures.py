@@ -13,6 +13,7 @@ from lab.options import Options
 from lab.plots import plot_filmstrip, plot_learning_curves, plot_success
 from lab.policies import Policy
 from lab.report import labelled, per_seed
+from lab.tasks import title_of
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.training import record_filmstrip
@@ -29,7 +30,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
             continue
         played = [p for p in policies if p.name in set(mine.policy)]
         chunks = ", ".join(map(str, sorted(set(mine.chunk))))
-        title = f"{played[0].task().title}, H = {chunks}"
+        title = f"{title_of(played[0].task())}, H = {chunks}"
         plot_success(per_seed(mine, 1), out / f"success{end}.png", title=title)
         label = dict(zip(mine.policy, mine.method, strict=True))
         losses: dict[str, list[list[tuple[int, float]]]] = {}

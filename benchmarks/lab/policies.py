@@ -29,7 +29,7 @@ from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
 from lab.report import read_rows
-from lab.tasks import DataOptions, load_task, task_places
+from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import mean_revision, smoothness
 from warmprior.io.distributed import from_leader, rank
@@ -136,10 +136,10 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
         network = options.network if task.images else options.network.without_images()
         for training in options.trainings():
             for method in options.sources.methods():
-                if method.chunk_length > task.longest:
+                if method.chunk_length > longest_of(task):
                     raise ValueError(
-                        f"{method} predicts more steps than the longest demonstration of {task.title} has, "
-                        f"{task.longest}: choose a shorter --chunk"
+                        f"{method} predicts more steps than the longest demonstration of {title_of(task)} "
+                        f"has, {longest_of(task)}: choose a shorter --chunk"
                     )
                 for seed in options.seeds:
                     seeded, grid = replace(training, seed=seed), options.evaluation.grid
@@ -185,7 +185,7 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     facts = {
         "task": task.name,
         "data": task.style,
-        **task.space,
+        **space_of(task),
         **method.facts,
         "seed": like.training.seed,
         "iterations": like.training.iterations,

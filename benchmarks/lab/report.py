@@ -21,6 +21,7 @@ from lab.files import PartialFailure, read_lines
 from lab.methods import label
 from lab.options import IMAGES, Options, with_parts
 from lab.paper import paper_success
+from lab.statistics import top_k_mean
 from warmprior import diagnostics as stats
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
@@ -82,7 +83,7 @@ def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
     rows = rows.reset_index(drop=True)
     groups = rows.groupby(keys, sort=False, dropna=False)
     found = rows.loc[groups["checkpoint"].idxmax()]
-    best = groups["success_rate"].agg(lambda rates: stats.top_k_mean(list(rates), top_k))
+    best = groups["success_rate"].agg(lambda rates: top_k_mean(list(rates), top_k))
     counts = groups["checkpoint"].nunique()
     return found.assign(success=best.to_numpy(), checkpoints=counts.to_numpy()).reset_index(drop=True)
 

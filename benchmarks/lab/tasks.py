@@ -25,6 +25,7 @@ from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import TASKS, get_task
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
+from warmprior.keys import EPISODE
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.encoder import imagenet_weights
 from warmprior.training import NetworkOptions, Task
@@ -246,7 +247,7 @@ def robosuite_task(
     if place != path:  # of what it was rendered from
         original = opened(path)
         facts |= {"file": original.name, "sha256": original.digest()}
-        digest = digest_of(facts["sha256"], demos, task.space, facts["images"], renderer_versions())
+        digest = digest_of(facts["sha256"], demos, space_of(task), facts["images"], renderer_versions())
     return replace(task, facts=facts, digest=digest)
 
 
@@ -314,8 +315,8 @@ def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
     Examples:
         >>> from lab.tasks import navigation_task
         >>> task = navigation_task()
-        >>> task.title, task.make_env(batch_size=[8]).batch_size
-        ('navigation toy', torch.Size([8]))
+        >>> task.name, task.make_env(batch_size=[8]).batch_size
+        ('navigation', torch.Size([8]))
     """
     if style not in ("toy", "position"):
         raise ValueError(f"the style of the toy is 'toy' or 'position', got {style!r}")
@@ -339,8 +340,8 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 
     Examples:
         >>> from lab.tasks import DataOptions, load_task
-        >>> load_task(DataOptions(), "navigation").title
-        'navigation toy'
+        >>> load_task(DataOptions(), "navigation").style
+        'toy'
     """
     if name == "navigation":
         return navigation_task("position" if style == "position" else "toy")
@@ -390,3 +391,28 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
                 styles = there
         found |= dict.fromkeys((name, style) for style in styles)
     return list(found)
+
+
+def space_of(task: Task) -> dict[str, str]:
+    """Return the spaces of actions and observations, where they are not the recorded one and the state."""
+    return {key: task.facts[key] for key in ("actions", "obs") if key in task.facts}
+
+
+def title_of(task: Task) -> str:
+    """Return task, style and what is unusual, for figures.
+
+    >>> title_of(load_task(DataOptions(), "navigation"))
+    'navigation toy'
+    """
+    source = task.facts.get("source")
+    words = {"actions": "actions", "obs": "observations"}
+    parts = [f"{task.name} {task.style}" + (f" ({source} data)" if source else "")]
+    parts += [f"{value} {words[key]}" for key, value in space_of(task).items()]
+    if (task.facts.get("images") or {}).get("fast_rendering"):
+        parts.append("rendered fast")
+    return ", ".join(parts)
+
+
+def longest_of(task: Task) -> int:
+    """Return the number of steps of the longest demonstration."""
+    return int(task.data[EPISODE].flatten().bincount().max())

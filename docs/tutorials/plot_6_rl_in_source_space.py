@@ -26,6 +26,8 @@ from warmprior import (
     PreconditionedNetwork,
     PriorAnchor,
     PriorDecoder,
+    PriorSpaceConfig,
+    PriorSpaceTraining,
     SourceMoments,
     VelocityMLP,
     WarmPriorActor,
@@ -39,7 +41,6 @@ from warmprior.envs import (
     navigation_heights,
     navigation_positions,
 )
-from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 from warmprior.training import evaluate
 
 torch.manual_seed(0)
@@ -203,7 +204,7 @@ plt.show()
 #
 # Training the agents
 # -------------------
-# :class:`~warmprior.rl.PriorSpaceTraining` collects, learns with DSRL-NA
+# :class:`~warmprior.PriorSpaceTraining` collects, learns with DSRL-NA
 # (:class:`~warmprior.DSRLNALoss`), evaluates, and saves, so that the same line goes on after an
 # interruption. The box is 0.5 around a mean and 1.5 around zero by default. The first 2,000 control
 # steps are collected without an agent, by residuals from the prior.

@@ -145,7 +145,7 @@ def test_every_method_is_trained_with_what_it_needs_before_it(tmp_path, capsys):
     for name, policy in policies.items():
         actor, own_time = policy.load(), json.loads(policy.status.read_text())["seconds"]
         assert (policy.folder / "learner.safetensors").exists() == (name in LEARNT)
-        assert actor.ode.max_nfe == (1 if name == "regression" else None)
+        assert actor.sampling.max_nfe == (1 if name == "regression" else None)
         assert all(bool(torch.isfinite(p).all()) for p in actor.parameters())
         # A training needs its teacher's.
         assert (rows[name]["training_seconds"] > own_time) == (name == "reflow")

@@ -72,7 +72,8 @@ def test_a_forecast_learns_mean_and_spread(kind, data, batch):
     level = batch["observation"][:, 0, :1, None].expand_as(mean)
     assert float((mean - level).square().mean().sqrt()) < 0.08
     if kind is not ForecastStart:
-        _, scale, warm = learner.distribution(batch["history"], batch["observation"])
+        source = learner.distribution(batch["history"], batch["observation"])
+        scale, warm = source.scale, source.warm
         assert float(scale.mean()) == pytest.approx(NOISE, rel=0.1)
         assert warm.all()  # where the network is, that is everywhere
 
@@ -127,12 +128,14 @@ def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     g = torch.Generator().manual_seed(0)
     history, seen = random_history(prior, 500, action_dim=3), torch.rand(500, 1, D_O, generator=g)
     factor = torch.tensor([[0.2, 1.0, 5.0], [3.0, 0.5, 2.0]])
-    mean, scale, _ = prior.distribution(history, seen)
+    source = prior.distribution(history, seen)
+    mean, scale = source.loc, source.scale
     a1 = mean + factor * scale * torch.randn(500, H, 3, generator=g)
     counted = torch.rand(500, H, 1, generator=g) < 0.7
     a1 = a1.masked_fill(~counted, 100.0)
     prior.calibrate(learning_windows(a1, counted, history, seen))
-    same, calibrated, _ = prior.distribution(history, seen)
+    source = prior.distribution(history, seen)
+    same, calibrated = source.loc, source.scale
     assert torch.equal(same, mean)
     torch.testing.assert_close(calibrated / scale, factor.expand_as(scale), rtol=0.1, atol=0)
     squared = ((a1 - mean) / calibrated).square().masked_fill(~counted, 0.0).sum(0)

@@ -30,7 +30,8 @@ def test_forecast_is_the_previous_prediction():
         return (goal - a) / (1 - t).clamp_min(1e-6)
 
     out = deployed_history(policy(field, prior), batch(length=2 * H))
-    loc, _, warm = prior.distribution(out["history"])
+    source = prior.distribution(out["history"])
+    loc, warm = source.loc, source.warm
     expected = torch.arange(H, 2 * H).float()
     torch.testing.assert_close(loc[:, :H, 0], expected.expand(5, -1))
     assert warm[:, :H].all() and not warm[:, H:].any()

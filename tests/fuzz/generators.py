@@ -324,9 +324,9 @@ def mutate_states(folder: Path, rng: np.random.Generator) -> Case:
         cloning = training(case, CONFIG)
         stored, facts = load_state(whole)
         mine = {
-            **named("trained", module_tensors(cloning.trained)),
-            **named("ema", module_tensors(cloning.ema)),
-            **named("optimizer", snapshot_optimizer(cloning.optimizer)),
+            **named("trained", module_tensors(cloning.update.trained)),
+            **named("ema", module_tensors(cloning.update.ema)),
+            **named("optimizer", snapshot_optimizer(cloning.update.optimizer)),
         }
         restored = all(torch.equal(stored[name], value) for name, value in mine.items())
         same = (cloning.iteration, [list(pair) for pair in cloning.losses]) == (

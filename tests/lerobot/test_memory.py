@@ -53,7 +53,7 @@ def test_an_episode_that_begins_inside_a_chunk():
     history = memory.decide(2)
     assert row(history) == [[0, 0, -5, 3], [2], [0] * 8, [0]]
     assert row(history, 1) == [[0, 101, -6, 103], [3], [104, 105, 106, 107, 108, 0, 0, 0], [5]]
-    _, _, warm = PreviewPrior(4).distribution(history)
+    warm = PreviewPrior(4).distribution(history).warm
     assert warm[:, :4].all(1).flatten().tolist() == [False, True]
     # From its own first chunk on it has a plan as others have.
     memory.record(chunk(21, 8))

@@ -6,8 +6,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from tests.toy_env import Halfway, random_history
+from tests.toy_env import ACTION_DIM, CountingEnv, Halfway, random_history
 from warmprior import (
     GaussianPrior,
     PastPrior,
@@ -16,6 +19,7 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
     keys,
+    policy_transforms,
 )
 from warmprior.history import ENTRIES, advance, cold_history
 
@@ -102,7 +106,7 @@ def test_one_evaluation_alone():
     """A network that was trained at t = 0 alone, as by regression."""
     prior = GaussianPrior(H)
     actor = actor_for(prior, max_nfe=1)
-    assert (actor.ode.nfe, actor_for(prior).ode.nfe) == (1, 9)
+    assert (actor.sampling.evaluations(), actor_for(prior).sampling.evaluations()) == (1, 9)
     with pytest.raises(ValueError, match=r"at most 1 network evaluation\(s\).*nfe=3"):
         actor_for(prior, nfe=3, max_nfe=1)
     with pytest.raises(ValueError, match=r"at most 1 network evaluation\(s\).*nfe=9"):
@@ -114,15 +118,92 @@ def test_one_evaluation_alone():
 def test_what_is_replaced_and_what_stays():
     actor = actor_for(PastPrior(H), observation_key="state", clip=(0.1, 0.2), start=Halfway())
     again = actor.replace(prior=GaussianPrior(H))
-    assert isinstance(again.prior, GaussianPrior) and again.in_keys[0] == "state"
-    assert again.start is actor.start and again.ode.clip == [0.1, 0.2]
+    assert isinstance(again.prior, GaussianPrior) and again.observation_key == "state"
+    assert again.start is actor.start and again.sampling.clip == (0.1, 0.2)
     # What was not chosen follows from the rest, and what was stays.
-    assert actor.replace(max_nfe=1).ode.nfe == 1
+    assert actor.replace(max_nfe=1).sampling.evaluations() == 1
     four = actor.replace(nfe=4)  # as of a saved policy, whose number was chosen
-    assert four.replace(max_nfe=1).ode.nfe == 1 and four.replace(max_nfe=8).ode.nfe == 4
+    assert four.replace(max_nfe=8).sampling.nfe == four.replace(prior=GaussianPrior(H)).sampling.nfe == 4
     with pytest.raises(ValueError, match="at most 1 network evaluation"):
-        four.replace(max_nfe=1, nfe=4)
-    assert actor.replace(nfe=4).replace(prior=GaussianPrior(H)).ode.nfe == 4
+        four.replace(max_nfe=1)
+
+
+OWN_KEYS = {
+    "observation_key": ("left", "observation"),
+    "history_key": ("left", "history"),
+    "source_key": ("left", "source"),
+    "chunk_key": ("left", "chunk"),
+}
+
+
+def test_keys_of_its_own_give_the_same_chunks():
+    prior = PreviewPrior(H)
+    actor, data = actor_for(prior, nfe=2), batch(prior, 4)
+    own = actor.replace(**OWN_KEYS)
+    renamed = TensorDict({"left": data.select("observation", "history")}, [4])
+    out = actor(data, generator=torch.Generator().manual_seed(0))
+    left = own(renamed, generator=torch.Generator().manual_seed(0))["left"]
+    assert torch.equal(left["chunk"], out["vla_action", "chunk"])
+    assert torch.equal(left["source", "noise"], out["prior", "noise"])
+    assert set(own.out_keys) == {("left", "source", n) for n in ("loc", "warm", "noise")} | {
+        ("left", "chunk")
+    }
+    assert own.replace(nfe=1).tensor_keys == OWN_KEYS
+
+
+def test_dispatch_takes_tensors_and_returns_tensors():
+    prior = PastPrior(H)
+    actor, data = actor_for(prior, nfe=2), batch(prior, 4)
+    tensors = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in actor.in_keys}
+    *_, chunk = actor(**tensors, generator=torch.Generator().manual_seed(0))
+    expected = actor(data, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(chunk, expected["vla_action", "chunk"])
+
+
+@pytest.mark.parametrize("start", [None, Halfway()], ids=["source", "start point"])
+def test_the_temperature_scales_the_noise_of_the_source_alone(start):
+    prior = PastPrior(H, sigma=0.3, correlation=0.4)
+    actor, data = actor_for(prior, nfe=2, start=start), batch(prior, 4)
+
+    def noise(policy):
+        return policy(data.clone(), generator=torch.Generator().manual_seed(0))["prior", "noise"]
+
+    mean, whole = noise(actor.replace(temperature=0.0)), noise(actor)
+    torch.testing.assert_close(noise(actor.replace(temperature=0.25)), mean + 0.25 * (whole - mean))
+    loc = prior.distribution(data["history"]).loc
+    expected = loc if start is None else data["history", "actions"][:, -1:] + 0.5 * loc
+    torch.testing.assert_close(mean, expected)
+    for exploration, point in {
+        ExplorationType.DETERMINISTIC: mean,
+        ExplorationType.MEAN: mean,
+        ExplorationType.RANDOM: whole,
+    }.items():
+        with set_exploration_type(exploration):
+            assert torch.equal(noise(actor), point)
+            assert torch.equal(noise(actor.replace(temperature=1.0)), whole)  # what was chosen stays
+    for wrong in (-0.1, float("nan")):
+        with pytest.raises(ValueError, match="temperature"):
+            actor.replace(temperature=wrong)
+
+
+def test_a_spec_is_kept_by_key_and_collectors_accept_it():
+    torch.manual_seed(0)
+    network = VelocityMLP(ACTION_DIM, 2 + ACTION_DIM, H, TO, hidden_dim=8)
+    env = TransformedEnv(CountingEnv(7), policy_transforms(PastPrior(H)))
+    chunk = env.full_action_spec[keys.CHUNK]
+    actor = WarmPriorActor(network, PastPrior(H, sigma=0.0), nfe=1, clip=1.0, spec=chunk)
+    assert actor.replace(nfe=2).spec[keys.CHUNK] == chunk and actor_for(PastPrior(H)).spec is None
+    batches = []
+    for policy in (actor, actor.replace(spec=None)):
+        torch.manual_seed(0)
+        env = TransformedEnv(CountingEnv(7), policy_transforms(PastPrior(H)))
+        collector = Collector(env, policy, frames_per_batch=6, total_frames=6)
+        batches += [batch.exclude("collector") for batch in collector]
+        collector.shutdown()
+    one, other = batches
+    assert set(one.keys(True, True)) == set(other.keys(True, True))
+    assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True))
+    assert chunk.is_in(one[keys.CHUNK][0])
 
 
 class Chunks(nn.Module):

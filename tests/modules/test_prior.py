@@ -26,7 +26,8 @@ def test_lengths_and_default_sigma(prior_class, horizon):
 def test_sample_is_equation_one(prior_class, sigma):
     prior = prior_class(3, sigma=sigma)
     history = random_history(prior, 50)
-    loc, _, warm = prior.distribution(history)
+    source = prior.distribution(history)
+    loc, warm = source.loc, source.warm
     assert warm.any() and not warm.all()
     a0 = prior.sample(history, generator=torch.Generator().manual_seed(3))
     eps = torch.randn(loc.shape, generator=torch.Generator().manual_seed(3))
@@ -41,7 +42,8 @@ def test_sample_is_equation_one(prior_class, sigma):
 def test_the_gaussian_source_is_the_usual_one():
     """To the bit, whatever the history."""
     prior = GaussianPrior(3)
-    loc, scale, warm = prior.distribution(random_history(prior, 5, cold=0.0))
+    source = prior.distribution(random_history(prior, 5, cold=0.0))
+    loc, scale, warm = source.loc, source.scale, source.warm
     assert not loc.any() and not warm.any() and (scale == 1).all()
     a0 = prior.sample(random_history(prior, 5), generator=torch.Generator().manual_seed(0))
     assert torch.equal(a0, torch.randn(5, 3, 2, generator=torch.Generator().manual_seed(0)))

@@ -29,7 +29,8 @@ class Observing(PastPrior):
     name = "observing-of-the-sampler"
 
     def distribution(self, history, observation=None):
-        loc, scale, warm = super().distribution(history)
+        source = super().distribution(history)
+        loc, scale, warm = source.loc, source.scale, source.warm
         return Source(loc + observation[..., -1:, :], scale, warm)
 
 

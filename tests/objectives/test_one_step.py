@@ -9,8 +9,9 @@ import torch
 
 from tests.objectives.test_flow_matching import actor_for, sample
 from tests.paths import PolynomialInterpolant
-from warmprior import FlowMatchingLoss, GaussianPrior, PastPrior, PreviewPrior
+from warmprior import FlowMatchingLoss, GaussianPrior, PastPrior, PreviewPrior, SelfDistillationLoss
 from warmprior.modules import StartPoint
+from warmprior.training import TrainingConfig
 
 H = 3
 PRIORS = [GaussianPrior(H), PastPrior(H, sigma=0.4), PreviewPrior(H)]
@@ -26,6 +27,11 @@ class Late(StartPoint):
 def losses_of(actor, data, **options):
     generator = torch.Generator().manual_seed(2)
     return FlowMatchingLoss(actor, generator=generator, **options)(data)
+
+
+def distilled(actor, data, **options):
+    generator = torch.Generator().manual_seed(2)
+    return SelfDistillationLoss(actor, generator=generator, **options)(data)["loss_self_distillation"]
 
 
 def ends(prior, data):
@@ -77,39 +83,34 @@ def test_self_distillation_by_hand(prior, objective, start):
     else:
         errors = (jump - (a - begin) / (1 - s)).square()
     counted = ~data["action_is_pad"][:n]
-    expected = 0.7 * errors[counted].mean()
+    expected = errors[counted].mean()
     gradients = torch.autograd.grad(expected, list(actor.network.parameters()))
 
-    options = {"objective": objective, "self_distillation": 0.7, "teacher": teacher}
-    found = losses_of(actor, data, **options)
-    torch.testing.assert_close(found["loss_self_distillation"], expected, rtol=1e-4, atol=1e-6)
-    found["loss_self_distillation"].backward()
+    options = {"objective": objective, "teacher": teacher}
+    loss = distilled(actor, data, **options)
+    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-6)
+    loss.backward()
     for parameter, gradient in zip(actor.network.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
     assert all(p.grad is None for p in teacher.parameters())
-    # The other loss is what it is without.
-    alone = losses_of(actor, data, objective=objective)["loss_flow_matching"]
-    assert torch.equal(found["loss_flow_matching"], alone)
-    unreduced = losses_of(actor, data, reduction="none", **options)["loss_self_distillation"]
-    torch.testing.assert_close(unreduced, 0.7 * errors * counted[..., None], rtol=1e-4, atol=1e-5)
+    unreduced = distilled(actor, data, reduction="none", **options)
+    torch.testing.assert_close(unreduced, errors * counted[..., None], rtol=1e-4, atol=1e-5)
 
 
 def test_without_a_teacher_the_network_teaches_itself_and_no_gradient_flows_back():
     prior = PastPrior(H)
     actor, data = actor_for(prior), sample(prior, 12)
-    found = losses_of(actor, data, self_distillation=1.0)
-    twin = losses_of(actor, data, self_distillation=1.0, teacher=copy.deepcopy(actor.network))
-    assert torch.equal(found["loss_self_distillation"], twin["loss_self_distillation"])
+    own, twin = distilled(actor, data), distilled(actor, data, teacher=copy.deepcopy(actor.network))
+    assert torch.equal(own, twin)
     parameters = list(actor.network.parameters())
-    mine, theirs = (torch.autograd.grad(loss["loss_self_distillation"], parameters) for loss in (found, twin))
-    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
+    gradients = (torch.autograd.grad(loss, parameters) for loss in (own, twin))
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"objective": "l2"}, "objective must be one of velocity, l1, got 'l2'"),
-        ({"self_distillation": -1.0}, "self_distillation must be a finite weight >= 0, got -1.0"),
         ({"objective": "l1", "interpolant": PolynomialInterpolant()}, "straight path.*Polynomial"),
     ],
 )
@@ -132,9 +133,12 @@ def test_regression_is_the_error_of_one_step_from_the_source(prior):
 
 def test_regression_has_no_flow():
     actor = actor_for(PastPrior(H), max_nfe=1)
-    for name, value in (("objective", "l1"), ("self_distillation", 0.5)):
-        with pytest.raises(ValueError, match=f"{name} = {value} needs a flow.*times = 'start'"):
-            FlowMatchingLoss(actor, times="start", **{name: value})
+    with pytest.raises(ValueError, match=r"needs a flow.*t = 0 alone"):
+        SelfDistillationLoss(actor)
+    with pytest.raises(ValueError, match=r"self_distillation.*times = 'start'"):
+        TrainingConfig(times="start", self_distillation=0.5)
+    with pytest.raises(ValueError, match="self_distillation must be >= 0"):
+        TrainingConfig(self_distillation=-1.0)
     with pytest.raises(ValueError, match="build the policy with max_nfe=1"):
         FlowMatchingLoss(actor_for(PastPrior(H)), times="start")
     with pytest.raises(ValueError, match="use LinearInterpolant, not PolynomialInterpolant"):

@@ -9,7 +9,7 @@ import torch
 
 from tests.objectives.test_flow_matching import actor_for, loss_of, sample
 from warmprior import FlowMatchingLoss, PastPrior
-from warmprior.objectives.flow_matching import TIMES
+from warmprior.objectives.times import TIMES
 
 N = 200_000
 CPU = torch.device("cpu")

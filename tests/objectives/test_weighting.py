@@ -14,6 +14,7 @@ from warmprior import (
     LinearInterpolant,
     PastPrior,
     PreconditionedNetwork,
+    SelfDistillationLoss,
     SourceMoments,
     VelocityMLP,
     WarmPriorActor,
@@ -102,8 +103,8 @@ def test_errors_are_divided_coordinate_by_coordinate():
     windows["action_is_pad"][0, 1] = True
     times = torch.rand(6)
 
-    def errors(**options):
-        module = FlowMatchingLoss(
+    def errors(loss=FlowMatchingLoss, **options):
+        module = loss(
             actor,
             times=lambda shape, *_: times,
             reduction="none",
@@ -119,7 +120,7 @@ def test_errors_are_divided_coordinate_by_coordinate():
     assert not weighed[key][0, 1].any()
     plain, weighed = (errors(objective="l1", weighting=w) for w in ("velocity", "standardised"))
     torch.testing.assert_close(weighed[key], plain[key] / unit)
-    plain, weighed = (errors(self_distillation=2.0, weighting=w) for w in ("velocity", "standardised"))
+    plain, weighed = (errors(SelfDistillationLoss, weighting=w) for w in ("velocity", "standardised"))
     key, start = "loss_self_distillation", actor.network.remainder(torch.zeros(1))
     torch.testing.assert_close(weighed[key], plain[key] / start.square())
 

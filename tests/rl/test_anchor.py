@@ -73,7 +73,8 @@ def test_everywhere(place, prior_class, execute):
         assert not torch.equal(new["prior", "anchor"], data["prior", "anchor"])
         for part in (data, data["next"]):
             anchor = part["prior", "anchor"]
-            loc, _, centred = prior.distribution(part["history"])
+            source = prior.distribution(part["history"])
+            loc, centred = source.loc, source.warm
             assert torch.equal(anchor[centred.expand_as(anchor)], loc[centred.expand_as(loc)])
             noise = anchor[~centred.expand_as(anchor)]
             assert len(noise) == len(noise.unique())
@@ -127,7 +128,7 @@ def test_a_learned_mean_is_the_anchor_from_the_first_decision_on():
     prior = Learned(H)
     data = observing(actor_for(prior))
     for part in (data, data["next"]):
-        mean, _, _ = prior.distribution(part["history"], part["observation"])
+        mean = prior.distribution(part["history"], part["observation"]).loc
         torch.testing.assert_close(part["prior", "anchor"], mean.detach())
         assert mean.any() and not part["prior", "anchor"].requires_grad
 

@@ -62,7 +62,7 @@ def make_env(seed, actor=None, truncate=True, hook=None, device="cpu", **chunkin
     for base in bases:
         base.before_step = None if seed == 0 else hook
     transforms = policy_transforms(
-        actor.prior, observation_steps=1, see_history=actor.in_keys[0] == keys.CONDITIONED, **chunking
+        actor.prior, observation_steps=1, see_history=actor.sees_history, **chunking
     )
     transforms.append(PriorAnchor(actor))
     return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)

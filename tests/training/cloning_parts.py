@@ -58,7 +58,7 @@ def run_until(cloning, iteration):
 def weights(cloning):
     return {
         **{f"net.{n}": v.clone() for n, v in cloning.actor.network.state_dict().items()},
-        **{f"ema.{n}": v.clone() for n, v in cloning.ema.state_dict().items()},
+        **{f"ema.{n}": v.clone() for n, v in cloning.update.ema.state_dict().items()},
     }
 
 

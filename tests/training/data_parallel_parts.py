@@ -56,13 +56,13 @@ def first_step(folder, case):
     """Its loss and gradients, and the points at which the network was evaluated."""
     points = []
     part = cloning(folder / "first" / f"{case} {rank()}", case)
-    part.loss_module.velocity_network.register_forward_pre_hook(
+    part.actor.network.register_forward_pre_hook(
         lambda network, inputs: points.append(inputs[1].detach().clone())
     )
     loss = part.step()
     if part._prefetch is not None:
         part._prefetch.close()
-    return loss, {n: p.grad.clone() for n, p in part.trained.named_parameters()}, points
+    return loss, {n: p.grad.clone() for n, p in part.update.trained.named_parameters()}, points
 
 
 def trained(folder, case):
@@ -100,8 +100,8 @@ def diverges(folder):
     """Windows of the second process alone lead to NaN."""
     part = cloning(folder / "diverges", "plain")
     if rank():
-        times = part.loss_module.times
-        part.loss_module.times = lambda *args: times(*args) * float("nan")
+        times = part.update.loss_module.times
+        part.update.loss_module.times = lambda *args: times(*args) * float("nan")
     try:
         part.run(None)
     except FloatingPointError as error:

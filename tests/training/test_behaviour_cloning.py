@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
-from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
+from warmprior import FlowMatchingLoss, SelfDistillationLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
 from warmprior.training.optim import make_optimizer
@@ -37,7 +37,11 @@ def test_the_loop_by_hand(tmp_path, options):
     actor = actor_for(network=other)
     generator = torch.Generator().manual_seed(config.seed)
     buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator)
-    loss = FlowMatchingLoss(actor, generator=generator, teacher=average, **options)
+    recipe = dict(options)
+    weight = recipe.pop("self_distillation", 0.0)
+    loss = FlowMatchingLoss(actor, generator=generator, **recipe)
+    recipe.pop("times", None)
+    distillation = SelfDistillationLoss(actor, generator=generator, teacher=average, **recipe)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
     losses = []
     for step in range(12):
@@ -45,8 +49,10 @@ def test_the_loop_by_hand(tmp_path, options):
         factor = (step + 1) / 3 if step < 3 else 0.5 * (1 + torch.tensor(progress * torch.pi).cos())
         for group in optimizer.param_groups:
             group["lr"] = float(config.learning_rate * factor)
-        found = loss(buffer.sample())
-        value = sum(found[key] for key in loss.out_keys)
+        batch = buffer.sample()
+        value = loss(batch)["loss_flow_matching"]
+        if weight:
+            value = value + weight * distillation(batch)["loss_self_distillation"]
         losses.append(value.item())
         optimizer.zero_grad()
         value.backward()

@@ -58,7 +58,7 @@ def test_a_full_disk(tmp_path, monkeypatch):
 def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
     """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
     cloning = training(tmp_path)
-    forward = cloning.loss_module.forward
+    forward = cloning.update.loss_module.forward
     calls = 0
 
     def broken(data):
@@ -69,7 +69,7 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
             out["loss_flow_matching"] = out["loss_flow_matching"] * float("nan")
         return out
 
-    cloning.loss_module.forward = broken
+    cloning.update.loss_module.forward = broken
     with pytest.raises(FloatingPointError, match=r"loss became nan .*state.safetensors"):
         cloning.run()
     tensors, facts = load_state(tmp_path / "state.safetensors")

@@ -92,6 +92,6 @@ def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     assert same(weights(again), weights(whole))
     policy = load_policy(whole.policy_path(CONFIG.iterations))
     assert not any("_orig_mod" in name for name in policy.state_dict())
-    expected = [value for value in whole.ema.module.state_dict().values()]
+    expected = [value for value in whole.update.ema.module.state_dict().values()]
     for one, two in zip(policy.network.state_dict().values(), expected, strict=True):
         assert torch.equal(one, two)

@@ -48,7 +48,7 @@ def test_the_windows_of_the_others_count(folder, tmp_path):
     alone = cloning(tmp_path, "plain", batch_size=STEPS.batch_size // 2)
     loss = alone.step()
     its_loss, gradients, _ = both(folder, "first")[0]["plain"]
-    own = {name: p.grad for name, p in alone.trained.named_parameters()}
+    own = {name: p.grad for name, p in alone.update.trained.named_parameters()}
     torch.testing.assert_close(loss, its_loss)
     learns = [name for name, gradient in gradients.items() if gradient.any()]
     assert learns and not any(torch.allclose(own[name], gradients[name]) for name in learns)

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
-from warmprior import FlowMatchingLoss, PastPrior, window_replay_buffer
+from warmprior import FlowMatchingLoss, PastPrior, SelfDistillationLoss, window_replay_buffer
 from warmprior.training import load_policy, precondition
 from warmprior.training.checkpoint import load_state
 
@@ -22,16 +22,16 @@ def preconditioned():
 
 
 @pytest.mark.parametrize("make", [actor_for, preconditioned])
-@pytest.mark.parametrize("options", [{}, {"self_distillation": 1.0}])
-def test_products_are_bf16_and_the_loss_is_close(make, options):
+@pytest.mark.parametrize("loss_class", [FlowMatchingLoss, SelfDistillationLoss])
+def test_products_are_bf16_and_the_loss_is_close(make, loss_class):
     losses, types = [], []
     for bf16 in (False, True):
         actor = make().eval()  # without dropout, which would draw other masks
         layers = [m for m in actor.network.modules() if isinstance(m, nn.Linear)]
         generator = torch.Generator().manual_seed(0)
-        loss = FlowMatchingLoss(actor, generator=generator, **options)
+        loss = loss_class(actor, generator=generator)
         seen = set()
-        for layer in loss.velocity_network.modules():
+        for layer in loss.actor_network.network.modules():
             if isinstance(layer, nn.Linear):
                 layer.register_forward_hook(lambda m, i, out, seen=seen: seen.add(out.dtype))
         torch.manual_seed(0)

@@ -53,7 +53,7 @@ def chunk(actor, **options):
     torch.manual_seed(7)
     data = TensorDict({"history": random_history(actor.prior, 4, action_dim=D_A)}, [4])
     width = actor.network.observation_dim
-    data[actor.in_keys[0]] = torch.randn(4, TO, width)
+    data[actor.observation_key] = torch.randn(4, TO, width)
     data[keys.DELAY] = torch.full((4, 1), 1)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -156,11 +156,11 @@ def test_missing_files(tmp_path):
         load_policy(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("version", [5, None, "6"])
+@pytest.mark.parametrize("version", [5, None, "7"])
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 6"):
+    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 7"):
         load_policy(tmp_path)
 
 

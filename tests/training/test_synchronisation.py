@@ -70,8 +70,8 @@ def test_a_step_reads_no_tensor(tmp_path, case):
     cloning = training(tmp_path, config, data=data, actor=actor)
     cloning.actor.train()
     cloning.step()  # the optimiser makes its state
-    assert cloning.ema.n_averaged.device.type == "cpu"
-    with Reads(cloning.ema.n_averaged) as seen:
+    assert cloning.update.ema.n_averaged.device.type == "cpu"
+    with Reads(cloning.update.ema.n_averaged) as seen:
         cloning.step()
     assert not seen.found
 
@@ -84,6 +84,6 @@ def test_what_reads_is_found(tmp_path):
         return a0, a1
 
     cloning = training(tmp_path, actor=actor_for(network=mlp()), coupling=reading)
-    with Reads(cloning.ema.n_averaged) as seen:
+    with Reads(cloning.update.ema.n_averaged) as seen:
         cloning.step()
     assert {"_local_scalar_dense", "nonzero", "index"} <= set(seen.found)

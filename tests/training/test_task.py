@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lab.tasks import DataOptions, load_task, read_like
+from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend
@@ -41,7 +41,7 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     assert set(task.data.keys()) == {"observation", "action", "episode"}
     assert torch.allclose(task.normalizer.denormalize(task.data)["action"], raw["action"])
     assert task.facts == {"demonstrations": 4, "steps": 40} and task.clip == 1.0
-    assert (task.title, task.longest, task.images) == ("own human", 10, {})
+    assert (title_of(task), longest_of(task), task.images) == ("own human", 10, {})
     assert raw["action"].max() > 50  # the data themselves stay as they were
     # What policies are trained on is what identifies it.
     again, other = (Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2))
@@ -100,9 +100,9 @@ def in_both_spaces(path):
 
 def test_absolute_actions_have_the_units_of_deltas(path):
     delta, absolute = in_both_spaces(path)
-    assert "actions" not in delta.facts and delta.title == "lift ph (file data)"
+    assert "actions" not in delta.facts and title_of(delta) == "lift ph (file data)"
     assert absolute.identity != delta.identity and absolute.data["action"].shape == (50, 10)
-    assert absolute.title == "lift ph (file data), absolute actions"
+    assert title_of(absolute) == "lift ph (file data), absolute actions"
     assert isinstance(absolute.adapters["actions"], AbsoluteActions) and not delta.adapters
     # What is executed spans what was recorded.
     units = [0.05] * 3 + [0.5] * 6

@@ -50,7 +50,7 @@ def test_what_is_done_before_makes_no_difference(tmp_path):
 def test_what_does_not_exist_is_refused_with_what_does():
     with pytest.raises(ValueError, match="style of the toy is 'toy' or 'position', got 'ph'"):
         navigation_task("ph")
-    with pytest.raises(ValueError, match=r"--network must be one of mlp, plain_mlp, .*, got 'nonsense'"):
+    with pytest.raises(ValueError, match=r"network must be one of mlp, plain_mlp, .*, got 'nonsense'"):
         NetworkOptions(network="nonsense")
 
 
@@ -62,6 +62,6 @@ def test_a_fresh_policy_has_the_parts_that_were_asked_for():
     )
     assert equal(first, again) and not equal(first, other)
     made = new_policy(task, PastPrior(4), NETWORK, CONFIG, max_nfe=1, see_history=True)
-    assert isinstance(made.network, PreconditionedNetwork) and made.ode.max_nfe == 1
+    assert isinstance(made.network, PreconditionedNetwork) and made.sampling.max_nfe == 1
     width = task.vector.shape[-1]
     assert made.network.observation_dim > first.network.observation_dim == width

@@ -107,7 +107,7 @@ def test_specs(prediction):
 @pytest.mark.parametrize("length", [2, 4])
 def test_wrong_chunk_length(length):
     env = TransformedEnv(CountingEnv(5), ChunkStep(3))
-    with pytest.raises(ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found shape \({length}, 2"):
+    with pytest.raises(ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found \({length}, 2"):
         env.step(ones(length)(env.reset()))
 
 
@@ -206,10 +206,9 @@ def test_the_sum_may_leave_the_bounds_of_one_reward(low, high, reward, gamma):
     assert (base.full_reward_spec["reward"].space.high == high).all()
 
 
-@pytest.mark.parametrize("shape", [(), (3, 2)])
-def test_actions_that_are_no_vector_are_refused(shape):
-    with pytest.raises(ValueError, match=r"one vector \[\*B, d_a\], but 'action' has shape \(2"):
-        TransformedEnv(VectorEnv(Unbounded((2, 1)), action_shape=shape), ChunkStep(3)).rollout(1)
+def test_actions_that_are_no_vector_are_refused():
+    with pytest.raises(ValueError, match=r"vectors \[\*B, d_a\], but 'action' has shape \(2"):
+        TransformedEnv(VectorEnv(Unbounded((2, 1)), action_shape=()), ChunkStep(3)).rollout(1)
 
 
 @pytest.mark.parametrize("place", ["single", "outside"])

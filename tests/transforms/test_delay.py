@@ -107,7 +107,8 @@ def test_the_past_is_what_was_executed(execute, delay):
     for row in range(2):
         for decision in range(9):
             before = history(rollout, row, decision)
-            loc, _, is_warm = prior.distribution(rollout["history"][row, decision])
+            source = prior.distribution(rollout["history"][row, decision])
+            loc, is_warm = source.loc, source.warm
             assert is_warm.all() == is_warm.any() == (len(before) >= 6)
             if is_warm.all():
                 warm += 1
@@ -200,7 +201,8 @@ def test_specs_and_jumps_where_chunks_take_effect():
         squares.append((made[d] - loc).square())
         loc = torch.cat([loc, played[d, :4]])[4:]
     expected = torch.cat(squares).mean().sqrt()
-    rollout[keys.LOC], _, rollout[keys.WARM] = PRIORS["past"].distribution(rollout["history"])
+    source = PRIORS["past"].distribution(rollout["history"])
+    rollout[keys.LOC], rollout[keys.WARM] = source.loc, source.warm
     assert mean_revision(rollout) == pytest.approx(float(expected), rel=1e-5)
 
 

@@ -131,7 +131,7 @@ def test_lengths_that_do_not_go_together():
     said = r'PreviewPrior.*needs 3 .*forecasts of 6.*"forecast"\) has 3: make windows and env'
     with pytest.raises(ValueError, match=said):
         env.rollout(2, actor)
-    with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 3, d_a\].* found shape \(6, 2\)"):
+    with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 3, d_a\].* found \(6, 2\)"):
         env.rollout(2, random_policy(6))
 
 
@@ -209,7 +209,8 @@ def test_every_decision_meets_the_mean_of_its_training_window(place):
     finally:
         env.close()
     warm = 0
-    for row, episode, frame, (loc, scale, mask) in decisions:
+    for row, episode, frame, source in decisions:
+        loc, scale, mask = source.loc, source.scale, source.warm
         actions = torch.stack(episodes[row][episode])
         expected = prior.distribution(window_histories(actions, torch.tensor(frame), 4))
         assert torch.equal(loc, expected.loc) and torch.equal(scale, expected.scale)

@@ -6,11 +6,9 @@ from warmprior.diagnostics.flow import SharedObservations, encoded_windows
 from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, memory_gain, source_leak
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
 from warmprior.diagnostics.statistics import (
-    bootstrap_ratio,
     paired_probability_better,
     probability_better,
     success_posterior,
-    top_k_mean,
 )
 
 __all__ = [
@@ -20,7 +18,6 @@ __all__ = [
     "Smoothness",
     "SourceLeak",
     "action_error",
-    "bootstrap_ratio",
     "branching_bound",
     "branching_cost",
     "curvature",
@@ -36,5 +33,4 @@ __all__ = [
     "source_coverage",
     "source_leak",
     "success_posterior",
-    "top_k_mean",
 ]

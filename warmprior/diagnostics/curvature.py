@@ -20,8 +20,9 @@ from warmprior.diagnostics.flow import (
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_keys, check_whole_numbers
+from warmprior.modules.interpolant import LinearInterpolant
 from warmprior.modules.network import velocity_field
-from warmprior.modules.ode import LinearInterpolant, integrate
+from warmprior.modules.ode import integrate
 from warmprior.modules.prior import Prior, Source
 
 

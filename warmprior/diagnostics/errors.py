@@ -114,7 +114,7 @@ def mean_error(
     """
     flat, target, rows, generator = judged(policy, windows)
     with evaluation_mode(policy):
-        nfe = policy.ode.nfe if nfe is None else nfe
+        nfe = policy.sampling.evaluations(nfe)
         chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
     mean, warm = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
     return MeanError(_rms((mean - target)[warm]), _rms((mean - chunk)[warm]))

@@ -58,7 +58,7 @@ class Windows:
 
 def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
     """Check a batch and bring it into shape; a ``KeyError`` or ``ValueError`` says what is wrong with it."""
-    observation_key = policy.in_keys[0]
+    observation_key = policy.observation_key
     needed = [*policy.in_keys, *([keys.CHUNK] if target_needed else [])]
     bare = "" if policy.ode.guidance is None else "; or measure policy.replace(guidance=None)"
     check_keys(batch, needed, "a batch of windows, or a rollout,", bare)
@@ -87,7 +87,8 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
         if value is not None:
             check_finite_steps(key, value)
     with torch.no_grad():
-        loc, _, warm = prior.distribution(history, observation)
+        source = prior.distribution(history, observation)
+        loc, warm = source.loc, source.warm
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
     return Windows(batch.batch_size, observation, history, loc, warm, counted, target)
 
@@ -109,14 +110,9 @@ def judged(
     return flat, flat.target, rows, torch.Generator(device).manual_seed(0)
 
 
-def sees_history(policy: WarmPriorActor) -> bool:
-    """Whether the network sees the last actions beside the observation."""
-    return policy.in_keys[0] == keys.CONDITIONED
-
-
 def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
     """Whether a policy's chunks depend on the history of windows ``[*B]`` with encoded images."""
-    sees = sees_history(policy) or policy.start is not None
+    sees = policy.sees_history or policy.start is not None
     return sees or bool(flat_windows(policy, windows).warm.any())
 
 
@@ -146,7 +142,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
         >>> encoded_windows(WarmPriorActor(network, PastPrior(4)), windows)["observation"].shape
         torch.Size([6, 2, 73])
     """
-    key = policy.in_keys[0]
+    key = policy.observation_key
     observation = windows.get(key, None)
     if not isinstance(observation, TensorDictBase):
         return windows
@@ -156,7 +152,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
     features = torch.cat(parts)  # type: ignore[arg-type]
     result = windows.copy().to(device).set(key, features)
-    if sees_history(policy):  # the same without the last actions, which stand behind the vector
+    if policy.sees_history:  # the same without the last actions, which stand behind the vector
         bare = windows[keys.OBSERVATION][keys.STATE].shape[-1]
         extended = observation[keys.STATE].shape[-1]
         without = torch.cat([features[..., :bare], features[..., extended:]], -1)
@@ -166,21 +162,13 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
     """Update the last actions that a network sees beside the observation after the history has changed."""
-    return HistoryObservation()(windows) if sees_history(policy) else windows
-
-
-def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
-    """The observations of a batch, without the last actions that some networks see beside them."""
-    key = policy.in_keys[0]
-    if sees_history(policy) and isinstance(batch.get(keys.OBSERVATION), Tensor):
-        key = keys.OBSERVATION
-    return batch.get(key)
+    return HistoryObservation()(windows) if policy.sees_history else windows
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
     """A ``ValueError`` if the field is not trained along a whole path of ``steps`` network evaluations."""
     check_whole_numbers(n_steps=steps)
-    most = policy.ode.max_nfe
+    most = policy.sampling.max_nfe
     if most is not None and steps > most:
         raise ValueError(f"the policy is trained for at most {most} network evaluation(s), not {steps}")
 
@@ -200,14 +188,14 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
 
 def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     """Those that the policy is trained for, ascending; a ``ValueError`` if none is."""
-    most = policy.ode.max_nfe
+    most = policy.sampling.max_nfe
     allowed = sorted({nfe for nfe in nfes if most is None or nfe <= most})
     if not allowed:
         raise ValueError(
             f"the policy is trained for at most NFE {most}, and {list(nfes)} has none: add {most}"
         )
     for nfe in allowed:
-        policy.ode.check_nfe(nfe)
+        policy.sampling.evaluations(nfe)
     return allowed
 
 
@@ -334,7 +322,7 @@ class SharedObservations:
 
         See :func:`deployed_history`. Observations with images are encoded, see :func:`encoded_windows`.
         """
-        see = sees_history(policy)
+        see = policy.sees_history
         earlier = self.windows(policy.prior, offset=self.chunk_length, see_history=see)
         met = deployed_history(policy, encoded_windows(policy, earlier), generator=generator)
         windows = self.windows(policy.prior, see_history=see).to(met.device).update(met)
@@ -342,7 +330,7 @@ class SharedObservations:
 
     def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Windows as at deployment: :meth:`deployed`, if the policy depends on the history."""
-        see = sees_history(policy)
+        see = policy.sees_history
         windows = encoded_windows(policy, self.windows(policy.prior, see_history=see))
         if depends_on_history(policy, windows):
             return self.deployed(policy, generator=generator)

@@ -20,10 +20,8 @@ from warmprior.diagnostics.flow import (
     evaluation_mode,
     flat_windows,
     judged,
-    observed,
     predict,
     seen_anew,
-    sees_history,
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_positive, check_shape, check_whole_numbers
@@ -158,7 +156,9 @@ def source_leak(
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
     with evaluation_mode(policy):
-        observation = observed(policy, windows).reshape(n, -1).to(device)
+        bare = policy.sees_history and isinstance(windows.get(keys.OBSERVATION), Tensor)
+        observation = windows.get(keys.OBSERVATION if bare else policy.observation_key)
+        observation = observation.reshape(n, -1).to(device)  # without the last actions, if it can be
         data_spread = _data_spread(observation, target, counted, episodes.to(device))
         for _ in range(draws):
             a0 = drawn(policy, rows, generator)
@@ -269,7 +269,7 @@ def memory_gain(
     flat = flat_windows(policy, encoded)
     device, n = flat.loc.device, len(flat)
     # A network that sees the last actions encodes them together with the images.
-    plain = (windows if sees_history(policy) else encoded).to(device)
+    plain = (windows if policy.sees_history else encoded).to(device)
     _check_seen(policy, plain)
     generator = torch.Generator(device).manual_seed(0)
     normal = torch.randn(n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device)
@@ -311,9 +311,9 @@ def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
 
 
 def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
-    if not sees_history(policy):
+    if not policy.sees_history:
         return
-    key = policy.in_keys[0]
+    key = policy.observation_key
     given, made = windows.get(key), seen_anew(policy, windows.copy()).get(key)
     if isinstance(given, TensorDictBase):
         given, made = given.get(keys.STATE), made.get(keys.STATE)

@@ -12,7 +12,6 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.robosuite import RobosuiteEnv
-from warmprior.keys import CONDITIONED
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
@@ -95,7 +94,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
         observation_steps=description["observation_steps"],
-        see_history=actor.in_keys[0] == CONDITIONED,
+        see_history=actor.sees_history,
         # A guided policy reads what is left of its last chunk.
         delay=None if actor.ode.guidance is None else 0,
     )

@@ -12,11 +12,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.history import ENTRIES
+from warmprior.history import history_keys
 from warmprior.lerobot.source import ChunkSource
-from warmprior.modules.checks import check_shape, check_whole_numbers
+from warmprior.modules.checks import check_shape
 from warmprior.modules.network import network_observation
-from warmprior.modules.prior import Prior
+from warmprior.modules.ode import Sampling
+from warmprior.modules.prior import Prior, noise_factor
 
 
 class LeRobotFlow(TensorDictModuleBase):
@@ -28,7 +29,7 @@ class LeRobotFlow(TensorDictModuleBase):
     """
 
     guidance = None
-    max_nfe = None
+    observation_key = keys.OBSERVATION
 
     def __init__(
         self,
@@ -41,14 +42,13 @@ class LeRobotFlow(TensorDictModuleBase):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.check_nfe(nfe)
+        self.sampling = Sampling(nfe=nfe)  # the model's own number of steps where none is given
         # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
         # contain this.
         self._policy = (policy,)
         self.source = self.network = source  # which has the width of actions
         self.names = dict(names or {})
         self.preprocess = preprocess
-        self.nfe = nfe
         self.seed = seed
         self.in_keys = [keys.NOISE, keys.OBSERVATION]
         self.out_keys = [keys.CHUNK]
@@ -58,17 +58,11 @@ class LeRobotFlow(TensorDictModuleBase):
         """LeRobot's policy."""
         return self._policy[0]
 
-    def check_nfe(self, nfe: int | None) -> None:
-        """Raise ValueError unless ``nfe`` is a number of integration steps, or ``None``."""
-        if nfe is not None:
-            check_whole_numbers(nfe=nfe)
-
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, padding: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
-        nfe = self.nfe if nfe is None else nfe
-        self.check_nfe(nfe)
+        nfe = self.sampling.nfe if nfe is None else self.sampling.evaluations(nfe)
         noise = tensordict[keys.NOISE]
         if torch.is_grad_enabled() and noise.requires_grad:
             raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
@@ -157,6 +151,7 @@ class LeRobotActor(TensorDictModuleBase):
     normalizer = None
     environment = None
     start = None
+    observation_key, history_key = keys.OBSERVATION, keys.HISTORY
 
     def __init__(
         self,
@@ -177,7 +172,7 @@ class LeRobotActor(TensorDictModuleBase):
         self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
         self.network = self.ode.network
         self.generator = generator
-        self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
+        self.in_keys = [keys.OBSERVATION, *history_keys()]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
 
     @property
@@ -185,13 +180,21 @@ class LeRobotActor(TensorDictModuleBase):
         """The source distribution."""
         return self.ode.source.prior
 
+    @property
+    def sampling(self) -> Sampling:
+        """How a chunk is drawn."""
+        return self.ode.sampling
+
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Sample the source and the chunk."""
         chunks, generator = self.ode.source, self.generator if generator is None else generator
         source = chunks.distribution(tensordict.get(keys.HISTORY, None))
-        loc, a0 = (chunks.scaled(v, source.warm) for v in (source.loc, source.sample(generator)))
+        loc, a0 = (
+            chunks.scaled(v, source.warm)
+            for v in (source.loc, source.sample(generator, noise_factor(self.sampling.temperature)))
+        )
         for key, value in zip(self.out_keys, (loc, source.warm, a0), strict=False):
             tensordict.set(key, value)
         padding = chunks.place(a0.reshape(-1, *a0.shape[-2:]), generator)

@@ -378,7 +378,7 @@ class WarmPriorAdapter:
             raise ValueError("delay is for policies whose chunk begins at the current step: leave it out")
         going_on = left[~self._memory.began]
         if self._delay and len(going_on):
-            (self.guidance or RealTimeChunking()).check_delay(self._delay, int(going_on.min()))
+            (self.guidance or RealTimeChunking()).check_reach(self._delay, int(going_on.min()))
         rest, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
         predicted = (..., self.source.positions, slice(self.source.action_dim))
         rest[predicted], width[predicted] = history["forecast"].to(dtype), scale

@@ -2,6 +2,7 @@
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
+from warmprior.modules.interpolant import BridgeInterpolant, Interpolant, LinearInterpolant
 from warmprior.modules.network import (
     AdaLNTransformer,
     ChiTransformer,
@@ -10,13 +11,7 @@ from warmprior.modules.network import (
     VelocityNetwork,
 )
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import (
-    BridgeInterpolant,
-    Interpolant,
-    LinearInterpolant,
-    ODEActor,
-    integrate,
-)
+from warmprior.modules.ode import ODEActor, Sampling, integrate
 from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
@@ -40,6 +35,7 @@ __all__ = [
     "PriorSampler",
     "RealTimeChunking",
     "RestingAction",
+    "Sampling",
     "Source",
     "SourceMoments",
     "StartPoint",

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import asdict
 from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
 
 from warmprior import keys
-from warmprior.history import ENTRIES
+from warmprior.history import history_keys
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import ODEActor, Solver
-from warmprior.modules.prior import Prior, Source
+from warmprior.modules.ode import ODEActor, Sampling
+from warmprior.modules.prior import Prior, Source, noise_factor
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
 
@@ -62,8 +64,11 @@ class PriorSampler(TensorDictModuleBase):
     Args:
         prior: the source distribution.
         start: the point from which samplers start, if that is not the source itself.
+        temperature: factor of the source's noise, see :class:`~warmprior.Sampling`.
         observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
             :meth:`~Prior.distribution` read it.
+        history_key: key of the history (:mod:`warmprior.history`).
+        source_key: where to write ``"loc"``, ``"warm"`` and ``"noise"``.
         generator: source of randomness; per call: ``sampler(data, generator=...)``. Worker processes take
             none, since all of them would draw the same noise.
 
@@ -88,16 +93,20 @@ class PriorSampler(TensorDictModuleBase):
         prior: Prior,
         *,
         start: StartPoint | None = None,
+        temperature: float | None = None,
         observation_key: NestedKey | None = None,
+        history_key: NestedKey = keys.HISTORY,
+        source_key: NestedKey = keys.SOURCE,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.prior, self.start, self.generator = prior, start, generator
+        self.temperature, self.history_key = temperature, history_key
         reads = start is not None or type(prior).distribution is not Prior.distribution
         self.observation_key = observation_key if reads else None
         observed = [] if self.observation_key is None else [self.observation_key]
-        self.in_keys = [*((keys.HISTORY, name) for name in ENTRIES), *observed]
-        self.out_keys = [keys.LOC, keys.WARM, keys.NOISE]
+        self.in_keys = [*history_keys(history_key), *observed]
+        self.out_keys = [unravel_key((source_key, name)) for name in ("loc", "warm", "noise")]
 
     def __getstate__(self) -> Any:
         if self.generator is not None and get_spawning_popen() is not None:
@@ -109,13 +118,14 @@ class PriorSampler(TensorDictModuleBase):
         return super().__getstate__()
 
     def source(self, tensordict: TensorDictBase) -> Source:
-        """The source of decisions or windows, ``[*B]``."""
+        """Return the source of decisions or windows, ``[*B]``."""
         return self.prior.distribution(*self._inputs(tensordict))
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
         """Write the mean, the warm positions, and the sample."""
-        source = self.source(tensordict)
-        point = source.sample(self.generator if generator is None else generator)
+        source, generator = self.source(tensordict), self.generator if generator is None else generator
+        point = source.sample(generator, noise_factor(self.temperature))
         if self.start is not None:
             point = self.start(point, *self._inputs(tensordict))
         for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):
@@ -123,7 +133,7 @@ class PriorSampler(TensorDictModuleBase):
         return tensordict
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Any, Any]:
-        history, key = tensordict.get(keys.HISTORY, None), self.observation_key
+        history, key = tensordict.get(self.history_key, None), self.observation_key
         return history, None if key is None else tensordict.get(key, None)
 
 
@@ -132,18 +142,14 @@ class WarmPriorActor(TensorDictModuleBase):
 
     Composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history that
     it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it works
-    unchanged in ``env.rollout``, collectors, batched environments and replay buffers. It ignores TorchRL's
-    ``ExplorationType``, because a flow needs its noise: seed the generator, or take a prior with ``sigma=0``.
+    unchanged in ``env.rollout``, collectors, batched environments and replay buffers. Under
+    ``ExplorationType.DETERMINISTIC`` the flow starts at the source's mean; otherwise at a draw, for which you
+    seed the generator.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
         prior: the source distribution.
-        nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or ``max_nfe``.
-        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``.
         start: the point from which samplers start, if that is not the source itself.
-        solver: see :func:`~warmprior.modules.ode.integrate`.
-        grid: see :func:`~warmprior.modules.ode.integrate`.
-        clip: see :class:`ODEActor`.
         guidance: makes chunks continue the one being executed; none by default.
         normalizer: the normaliser of the data; its :meth:`~warmprior.Normalizer.env_transforms` go next to
             the base environment.
@@ -153,6 +159,13 @@ class WarmPriorActor(TensorDictModuleBase):
         observation_key: key of the observation, ``[*B, To, d_o]``, or of several nested under it;
             :data:`warmprior.keys.CONDITIONED` where the network sees the last actions
             (:class:`~warmprior.HistoryObservation`).
+        history_key: key of the history.
+        source_key: where ``"loc"``, ``"warm"`` and ``"noise"`` are written.
+        chunk_key: where the chunk is written. With keys of their own, several policies share an environment
+            (:class:`~warmprior.ChunkStep`).
+        spec: of the chunk, or of several outputs by key, as of TorchRL's actors; none by default.
+        **sampling: options of :class:`Sampling`, such as ``nfe`` and ``temperature``; the number of network
+            evaluations also per call: ``actor(data, nfe=1)``.
 
     Raises:
         ValueError: if the network was built for another prediction length than the prior's, or see
@@ -177,17 +190,17 @@ class WarmPriorActor(TensorDictModuleBase):
         network: nn.Module,
         prior: Prior,
         *,
-        nfe: int | None = None,
-        max_nfe: int | None = None,
         start: StartPoint | None = None,
-        solver: Solver = "euler",
-        grid: str = "uniform",
-        clip: float | Sequence[float] | None = None,
         guidance: RealTimeChunking | None = None,
         normalizer: Normalizer | None = None,
         environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey = keys.OBSERVATION,
+        history_key: NestedKey = keys.HISTORY,
+        source_key: NestedKey = keys.SOURCE,
+        chunk_key: NestedKey = keys.CHUNK,
+        spec: TensorSpec | None = None,
+        **sampling: Any,
     ) -> None:
         super().__init__()
         built_for = getattr(network, "prediction_length", prior.prediction_length)
@@ -196,24 +209,36 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the network was built for prediction_length={built_for}, but {prior} needs "
                 f"{prior.prediction_length}"
             )
-        self._nfe_was_given = nfe is not None
-        self.sampler = PriorSampler(prior, start=start, observation_key=observation_key, generator=generator)
+        #: Keys of the policy's inputs and outputs, as arguments of the constructor.
+        self.tensor_keys: dict[str, NestedKey] = {
+            "observation_key": observation_key,
+            "history_key": history_key,
+            "source_key": source_key,
+            "chunk_key": chunk_key,
+        }
         self.ode = ODEActor(
             network,
-            nfe=nfe,
-            max_nfe=max_nfe,
             start_time=0.0 if start is None else start.time,
-            solver=solver,
-            grid=grid,
-            clip=clip,
             guidance=guidance,
+            **self.tensor_keys,
+            **sampling,
+        )
+        self.sampler = PriorSampler(
+            prior,
+            start=start,
+            temperature=self.sampling.temperature,
             observation_key=observation_key,
+            history_key=history_key,
+            source_key=source_key,
+            generator=generator,
         )
         self.normalizer = normalizer
         self.environment = environment
+        #: Specs of outputs, by their keys.
+        self.spec = spec if spec is None or isinstance(spec, Composite) else Composite({chunk_key: spec})
         guided = [] if guidance is None else [keys.DELAY]
         self.in_keys = list(dict.fromkeys([observation_key, *self.sampler.in_keys, *guided]))
-        self.out_keys = [*self.sampler.out_keys, *self.ode.out_keys]
+        self.out_keys = [*self.sampler.out_keys, chunk_key]
 
     @property
     def prior(self) -> Prior:
@@ -230,6 +255,27 @@ class WarmPriorActor(TensorDictModuleBase):
         """The velocity network."""
         return self.ode.network
 
+    @property
+    def sampling(self) -> Sampling:
+        """How a chunk is drawn."""
+        return self.ode.sampling
+
+    @property
+    def observation_key(self) -> NestedKey:
+        """Key of what the network sees."""
+        return self.ode.observation_key
+
+    @property
+    def history_key(self) -> NestedKey:
+        """Key of the history."""
+        return self.sampler.history_key
+
+    @property
+    def sees_history(self) -> bool:
+        """Whether the network sees the last actions, see :class:`~warmprior.HistoryObservation`."""
+        return self.observation_key == keys.CONDITIONED
+
+    @dispatch(auto_batch_size=False)
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
@@ -237,39 +283,30 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
 
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
-        """Integrate a given source sample, ``[*B, P, d_a]`` under ``keys.NOISE``, to the chunk."""
+        """Integrate a given source sample, ``[*B, P, d_a]`` under ``(source_key, "noise")``, to the chunk."""
         sigma = None if self.ode.guidance is None else self.sampler.source(tensordict).scale
         return self.ode(tensordict, nfe=nfe, sigma=sigma)
 
     def replace(self, **changes: Any) -> WarmPriorActor:
-        """A copy of the policy, with the same parts, and some constructor arguments changed.
-
-        A smaller ``max_nfe`` lowers ``nfe``.
+        """Return a copy of the policy, with the same parts, and some constructor arguments changed.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
             >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
             >>> one_step = actor.replace(nfe=1)
-            >>> actor.ode.nfe, one_step.ode.nfe, one_step.network is actor.network
-            (9, 1, True)
+            >>> actor.sampling.nfe, one_step.sampling.nfe, one_step.network is actor.network
+            (None, 1, True)
         """
-        ode = self.ode
-        mine = {
+        arguments = {
             "network": self.network,
             "prior": self.prior,
-            "nfe": ode.nfe if self._nfe_was_given else None,
-            "max_nfe": ode.max_nfe,
             "start": self.start,
-            "solver": ode.solver,
-            "grid": ode.grid,
-            "clip": ode.clip,
-            "guidance": ode.guidance,
+            "guidance": self.ode.guidance,
             "normalizer": self.normalizer,
             "environment": self.environment,
             "generator": self.sampler.generator,
-            "observation_key": self.in_keys[0],
+            "spec": self.spec,
+            **self.tensor_keys,
+            **asdict(self.sampling),
         }
-        options = mine | changes
-        if "nfe" not in changes and ode.nfe > (options["max_nfe"] or ode.nfe):
-            options["nfe"] = None
-        return type(self)(**options)
+        return type(self)(**arguments | changes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from http.client import HTTPException
 from pickle import UnpicklingError
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +14,13 @@ from torchrl.modules import ConvNet
 
 from warmprior import keys
 from warmprior.io.extras import require
+from warmprior.modules.checks import (
+    check_between,
+    check_choice,
+    check_keys,
+    check_shape,
+    check_whole_numbers,
+)
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config
 
@@ -94,13 +101,9 @@ class ImageEncoder(nn.Module):
         cameras = tuple(cameras)
         if not cameras or len(set(cameras)) < len(cameras):
             raise ValueError(f"an image encoder needs different cameras, got {list(cameras)}")
-        if state_dim < 0 or not 8 <= crop_size <= image_size:
-            raise ValueError(
-                f"need state_dim >= 0 and 8 <= crop_size <= image_size, got {state_dim}, {crop_size} and "
-                f"{image_size}"
-            )
-        if backbone not in ("resnet18", "small"):
-            raise ValueError(f"backbone is 'resnet18' or 'small', got {backbone!r}")
+        check_whole_numbers(0, state_dim=state_dim)
+        check_between(8, image_size, crop_size=crop_size)
+        check_choice("backbone", backbone, get_args(Backbone))
         self.cameras, self.state_dim = cameras, state_dim
         self.image_size, self.crop_size = image_size, crop_size
         self.backbone, self.share = backbone, share
@@ -169,26 +172,15 @@ class ImageEncoder(nn.Module):
         return window.unflatten(1, images.shape[1:3])
 
     def _check(self, observation: TensorDictBase) -> None:
-        wanted = [*([keys.STATE] if self.state_dim else []), *self.cameras]
-        missing = [key for key in wanted if key not in observation]
-        if missing:
-            raise KeyError(
-                f"the encoder needs the entries {wanted} of the observation; missing: {missing}, it has "
-                f"{sorted(map(str, observation.keys()))}"
-            )
-        if self.state_dim and observation[keys.STATE].shape[-1] != self.state_dim:
-            raise ValueError(
-                f"the encoder was built for {self.state_dim} numbers in {keys.STATE!r}, got "
-                f"{tuple(observation[keys.STATE].shape)}"
-            )
-        expected = (3, self.image_size, self.image_size)
-        for camera in self.cameras:
-            images = observation[camera]
-            if tuple(images.shape[-3:]) != expected or images.dtype != torch.uint8:
-                raise ValueError(
-                    f"the encoder was built for uint8 images [*B, To, 3, h, w] with (3, h, w) = {expected}, "
-                    f"but {camera!r} is {images.dtype} {tuple(images.shape)}"
-                )
+        shapes: dict[str, tuple[int, ...]] = {keys.STATE: (self.state_dim,)} if self.state_dim else {}
+        shapes |= dict.fromkeys(self.cameras, (3, self.image_size, self.image_size))
+        check_keys(observation, shapes, "the encoder", f"; there are {sorted(map(str, observation.keys()))}")
+        for name, shape in shapes.items():
+            value = observation[name]
+            batch = value.shape[: value.ndim - len(shape)]
+            check_shape(name, value, (*batch, *shape))
+            if name in self.cameras and value.dtype != torch.uint8:
+                raise ValueError(f"the image {name!r} is {value.dtype}, and the encoder takes uint8")
 
 
 def imagenet_weights() -> dict[str, Tensor]:

@@ -1,130 +1,22 @@
-"""The path from the source to the action chunk, and the integration of a velocity network along it."""
+"""Integration of a velocity network from the source to the action chunk."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
 from warmprior.modules.checks import check_finite_numbers, check_keys
 from warmprior.modules.network import network_observation, velocity_field
-from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.modules.registry import Registered
-
-
-class Interpolant(Registered):
-    r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.
-
-    Subclasses give :meth:`coefficients` and, for files, a ``name``. The coefficients must satisfy
-    :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and
-    ends at the data.
-
-    Examples:
-        >>> import math
-        >>> import torch
-        >>> from warmprior import Interpolant
-        >>> class SineInterpolant(Interpolant):
-        ...     name = "sine"
-        ...     def coefficients(self, t):
-        ...         beta = torch.sin(math.pi / 2 * t) ** 2
-        ...         speed = math.pi / 2 * torch.sin(math.pi * t)
-        ...         return 1 - beta, beta, -speed, speed
-        >>> a_t, velocity = SineInterpolant()(torch.zeros(1, 2, 1), torch.ones(1, 2, 1), torch.tensor([0.5]))
-        >>> round(float(a_t[0, 0]), 3), round(float(velocity[0, 0]), 3)
-        (0.5, 1.571)
-    """
-
-    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        r"""Return :math:`\alpha, \beta, \dot\alpha, \dot\beta` at times ``t`` in [0, 1], each like ``t``."""
-        raise NotImplementedError
-
-    def __call__(
-        self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
-        r"""Point on the path and its velocity :math:`\dot\alpha a_0 + \dot\beta a_1`, each ``[*B, P, d_a]``.
-
-        Source and data are ``[*B, P, d_a]``, the times ``[*B]``. The generator is of the noise of a path that
-        has some.
-        """
-        alpha, beta, d_alpha, d_beta = self.coefficients(t[..., None, None])
-        return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
-
-
-class LinearInterpolant(Interpolant):
-    r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
-
-    Examples:
-        >>> from warmprior import LinearInterpolant
-        >>> import torch
-        >>> a0, a1 = torch.zeros(1, 2, 1), torch.ones(1, 2, 1)
-        >>> a_t, velocity = LinearInterpolant()(a0, a1, torch.tensor([0.25]))
-        >>> a_t.flatten().tolist(), velocity.flatten().tolist()
-        ([0.25, 0.25], [1.0, 1.0])
-    """
-
-    name = "linear"
-
-    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Coefficients of the straight line."""
-        one = torch.ones_like(t)
-        return 1 - t, t, -one, one
-
-
-class BridgeInterpolant(Interpolant):
-    r"""Brownian bridge: the straight line with noise between its ends (Tong et al., 2024, Sec. 3.4).
-
-    .. math::
-        a_t = (1 - t) a_0 + t a_1 + \sigma \sqrt{t (1 - t)} \, \varepsilon, \qquad
-        u_t = a_1 - a_0 + \sigma \frac{1 - 2t}{2 \sqrt{t (1 - t)}} \, \varepsilon .
-
-    On pairs of :class:`~warmprior.objectives.BridgeCoupling` the mean of :math:`u_t` given :math:`a_t` is the
-    probability flow of the Schroedinger bridge. The velocity grows without bound towards the ends: times are
-    kept 0.001 away from them.
-
-    Args:
-        sigma: of the noise, > 0, in normalised action units.
-
-    Raises:
-        ValueError: if ``sigma`` is not a finite number > 0.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior import BridgeInterpolant
-        >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
-        >>> a_t, velocity = BridgeInterpolant(0.2)(a0, a1, t, torch.Generator().manual_seed(0))
-        >>> bool(a_t != 0.5), velocity.item()
-        (True, 1.0)
-    """
-
-    name = "bridge"
-
-    def __init__(self, sigma: float = 0.5) -> None:
-        check_finite_numbers(sigma=sigma)
-        if sigma <= 0:
-            raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
-        self.sigma = float(sigma)
-
-    coefficients = LinearInterpolant.coefficients
-
-    def __call__(
-        self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Point on the path and its velocity, with noise of ``generator``."""
-        point, velocity = super().__call__(a0, a1, t)
-        t = t[..., None, None].clamp(1e-3, 1 - 1e-3)
-        width = (t * (1 - t)).sqrt()
-        noise = torch.randn(point.shape, generator=generator, dtype=point.dtype, device=point.device)
-        noise = self.sigma * noise
-        return point + width * noise, velocity + (1 - 2 * t) / (2 * width) * noise
-
+from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
 JUMP = 0.5
 """Where the dense steps of ``dense-jump`` end; Chen et al. saw fields pull towards training actions later."""
@@ -183,15 +75,10 @@ DEFAULT_NFE = 9
 MAX_NFE = 10_000
 """More would take minutes per chunk, and look like a process that hangs."""
 
-GUIDED_BY = (keys.FORECAST, keys.FORECAST_STEPS, keys.DELAY)
-"""The further inputs of guided policies."""
-
 GUIDED_BY_WHOM = (
     ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
     "delay=0), and by AsyncExecutor on a robot"
 )
-
-Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -287,23 +174,90 @@ def integrate(
     return torch.stack(path, dim=1) if return_path else a
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """How a policy draws a chunk: the noise of its source, and the integration of its flow.
+
+    Attributes:
+        nfe: network evaluations per chunk; 9 by default, or ``max_nfe``.
+        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``.
+        solver: see :func:`integrate`.
+        grid: see :func:`integrate`.
+        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or one for each.
+            Set it to the range of the normalised data, such as 1: then the environment executes what the
+            prior remembers.
+        temperature: factor of the source's noise at decisions, ``a_0 = mu + temperature * sigma * eps``. By
+            default 1, and 0 under ``ExplorationType.DETERMINISTIC``, ``MEAN`` or ``MODE``: the flow then
+            starts at the source's mean.
+
+    Raises:
+        ValueError: for an option that is unknown, out of range or not what the network is trained for.
+
+    Examples:
+        >>> from warmprior import Sampling
+        >>> Sampling().evaluations(), Sampling(max_nfe=4).evaluations(), Sampling(solver="rk4").evaluations()
+        (9, 4, 8)
+    """
+
+    nfe: int | None = None
+    max_nfe: int | None = None
+    solver: Solver = "euler"
+    grid: str = "uniform"
+    clip: float | Sequence[float] | None = None
+    temperature: float | None = None
+
+    def __post_init__(self) -> None:
+        self.evaluations()
+        check_grid(self.grid)
+        bounds = self.clip if isinstance(self.clip, Sequence) else (1.0 if self.clip is None else self.clip,)
+        if isinstance(self.clip, Sequence):
+            object.__setattr__(self, "clip", tuple(bounds))
+        # A constant dimension is bounded by 0, but not all of them are constant.
+        if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
+            raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {self.clip}")
+        if self.temperature is not None:
+            check_finite_numbers(temperature=self.temperature)
+            if self.temperature < 0:
+                raise ValueError(f"temperature must be at least 0, got {self.temperature}")
+
+    def evaluations(self, nfe: int | None = None) -> int:
+        """Return ``nfe`` or its default; a ``ValueError`` unless solver and network support that many."""
+        nfe = self.nfe if nfe is None else nfe
+        if nfe is None:
+            nfe = DEFAULT_NFE if self.max_nfe is None else min(DEFAULT_NFE, self.max_nfe)
+            if self.solver in SOLVERS:  # rounded down to a multiple of the stages
+                stages = len(SOLVERS[self.solver].b)
+                nfe = max(nfe - nfe % stages, stages)
+        _steps(nfe, self.solver)
+        if self.max_nfe is not None and nfe > self.max_nfe:
+            raise ValueError(
+                f"the network is trained for at most {self.max_nfe} network evaluation(s) per chunk, got "
+                f"nfe={nfe}"
+            )
+        return nfe
+
+    def clamped(self, chunk: Tensor) -> Tensor:
+        """Return a chunk ``[*B, P, d_a]`` within its bounds."""
+        if isinstance(self.clip, Sequence):
+            bound = torch.tensor(self.clip, dtype=chunk.dtype, device=chunk.device)
+            return chunk.clamp(-bound, bound)
+        return chunk if self.clip is None else chunk.clamp(-self.clip, self.clip)
+
+
 class ODEActor(TensorDictModuleBase):
     """Transports the source to an action chunk: ``(noise, observation) -> chunk``.
 
     Args:
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
             observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
-        nfe: network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or ``max_nfe``.
-        max_nfe: the largest ``nfe`` that the training allows.
-        start_time: see :func:`integrate`.
-        solver: see :func:`integrate`.
-        grid: see :func:`integrate`.
-        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or one for each.
-            Set it to the range of the normalised data, such as 1: then the environment executes what the
-            prior remembers.
-        guidance: makes chunks continue the one being executed. It reads the rest of that chunk,
-            ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay.
+        start_time: where integration starts, see :func:`integrate`.
+        guidance: makes chunks continue the one being executed. It reads the rest of that chunk, the
+            history's ``"forecast"`` and ``"forecast_steps"``, and the delay.
         observation_key: key of the observation, ``[*B, To, d_o]``.
+        history_key: key of the history, which guidance reads.
+        source_key: where the source lies: ``(source_key, "noise")``, ``[*B, P, d_a]``.
+        chunk_key: where to write the chunk, ``[*B, P, d_a]``.
+        **sampling: options of :class:`Sampling`; per call: ``actor(data, nfe=3)``.
 
     Raises:
         ValueError: for an option that is unknown, out of range or not what the network is trained for.
@@ -314,74 +268,47 @@ class ODEActor(TensorDictModuleBase):
         >>> from tensordict import TensorDict
         >>> from warmprior import ODEActor, VelocityMLP
         >>> actor = ODEActor(VelocityMLP(action_dim=2, observation_dim=3, prediction_length=4), nfe=9)
-        >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
-        ...                    ("prior", "noise"): torch.randn(5, 4, 2)}, [5])
-        >>> actor(data, nfe=1)["vla_action", "chunk"].shape
-        torch.Size([5, 4, 2])
+        >>> noise, observation = torch.randn(5, 4, 2), torch.zeros(5, 2, 3)
+        >>> data = TensorDict({"observation": observation, ("prior", "noise"): noise}, [5])
+        >>> chunk = actor(data, nfe=1)["vla_action", "chunk"]
+        >>> bool((chunk == actor(prior_noise=noise, observation=observation, nfe=1)).all()), chunk.shape
+        (True, torch.Size([5, 4, 2]))
     """
 
     def __init__(
         self,
         network: nn.Module,
         *,
-        nfe: int | None = None,
-        max_nfe: int | None = None,
         start_time: float = 0.0,
-        solver: Solver = "euler",
-        grid: str = "uniform",
-        clip: float | Sequence[float] | None = None,
         guidance: RealTimeChunking | None = None,
         observation_key: NestedKey = keys.OBSERVATION,
+        history_key: NestedKey = keys.HISTORY,
+        source_key: NestedKey = keys.SOURCE,
+        chunk_key: NestedKey = keys.CHUNK,
+        **sampling: Any,
     ) -> None:
         super().__init__()
-        if nfe is None:
-            nfe = DEFAULT_NFE if max_nfe is None else min(DEFAULT_NFE, max_nfe)
-            if solver in SOLVERS:  # rounded down to a multiple of the stages
-                stages = len(SOLVERS[solver].b)
-                nfe = max(nfe - nfe % stages, stages)
-        self.max_nfe = max_nfe
-        self.start_time = start_time
-        self.solver = solver
-        self.check_nfe(nfe)
-        check_grid(grid)
-        # A list, as the configuration of a saved policy has it.
-        clip = clip if clip is None or isinstance(clip, int | float) else list(clip)
-        bounds = clip if isinstance(clip, list) else [1.0 if clip is None else clip]
-        # A constant dimension is bounded by 0, but not all of them are constant.
-        if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
-            raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {clip}")
-        width = getattr(network, "action_dim", None)
-        if isinstance(clip, list) and width not in (None, len(clip)):
+        self.sampling = Sampling(**sampling)
+        clip, width = self.sampling.clip, getattr(network, "action_dim", None)
+        if isinstance(clip, tuple) and width not in (None, len(clip)):
             raise ValueError(f"clip has {len(clip)} bounds, but the network has {width} action dimensions")
-        if guidance is not None and max_nfe == 1:
+        if guidance is not None and self.sampling.max_nfe == 1:
             raise ValueError(
                 "the network is trained at t = 0 alone, which is no flow to guide: leave the guidance out"
             )
-        self.network = network
-        self.nfe = nfe
-        self.grid = grid
-        self.clip = clip
-        self.guidance = guidance
-        self.in_keys = [keys.NOISE, observation_key]
+        self.network, self.start_time, self.guidance = network, start_time, guidance
+        self.observation_key = observation_key
+        self.in_keys = [unravel_key((source_key, "noise")), observation_key]
         if guidance is not None:
-            self.in_keys += GUIDED_BY
-        self.out_keys = [keys.CHUNK]
+            rest = [unravel_key((history_key, name)) for name in ("forecast", "forecast_steps")]
+            self.in_keys += [*rest, keys.DELAY]
+        self.out_keys = [chunk_key]
 
-    def check_nfe(self, nfe: int) -> None:
-        """A ``ValueError`` unless solver and network support ``nfe`` network evaluations."""
-        _steps(nfe, self.solver)
-        if self.max_nfe is not None and nfe > self.max_nfe:
-            raise ValueError(
-                f"the network is trained for at most {self.max_nfe} network evaluation(s) per chunk, got "
-                f"nfe={nfe}"
-            )
-
+    @dispatch(auto_batch_size=False)
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk; ``sigma``, 1 by default, is the source's deviation for the guidance."""
-        nfe = self.nfe if nfe is None else nfe
-        self.check_nfe(nfe)
         check_keys(tensordict, self.in_keys[:2], "ODEActor")
         check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
         a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)
@@ -399,14 +326,9 @@ class ODEActor(TensorDictModuleBase):
         chunk = integrate(
             velocity,
             a0.reshape(-1, *a0.shape[-2:]),
-            nfe=nfe,
-            solver=self.solver,
-            grid=self.grid,
+            nfe=self.sampling.evaluations(nfe),
+            solver=self.sampling.solver,
+            grid=self.sampling.grid,
             start_time=self.start_time,
-        ).reshape(a0.shape)
-        if isinstance(self.clip, list):
-            bound = torch.tensor(self.clip, dtype=chunk.dtype, device=chunk.device)
-            chunk = chunk.clamp(-bound, bound)
-        elif self.clip is not None:
-            chunk = chunk.clamp(-self.clip, self.clip)
-        return tensordict.set(keys.CHUNK, chunk)
+        )
+        return tensordict.set(self.out_keys[0], self.sampling.clamped(chunk.reshape(a0.shape)))

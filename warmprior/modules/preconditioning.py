@@ -13,9 +13,9 @@ from torchrl.data import ReplayBuffer
 
 from warmprior import keys
 from warmprior.modules.checks import check_positions
+from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import Interpolant, LinearInterpolant
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
@@ -278,7 +278,7 @@ class SourceMoments(nn.Module):
         Args:
             windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``, used once each.
             prior: the source distribution.
-            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`.
+            coupling: how the training pairs sources and targets, see :data:`~warmprior.Coupling`.
             samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
             generator: source of randomness of the source samples, on the windows' device.

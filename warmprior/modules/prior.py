@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from warmprior.history import check_history
-from warmprior.modules.checks import check_finite_numbers
+from warmprior.modules.checks import check_between, check_finite_numbers, check_whole_numbers
 from warmprior.modules.registry import Registered
+
+
+def noise_factor(temperature: float | None) -> float:
+    """Return the temperature of a decision: by default 1, and 0 where TorchRL explores deterministically."""
+    if temperature is not None:
+        return temperature
+    return 1.0 if exploration_type() in (None, ExplorationType.RANDOM) else 0.0
 
 
 @dataclass(frozen=True)
@@ -39,11 +46,11 @@ class Source:
     warm: Tensor
     correlation: float = 0.0
 
-    def __iter__(self) -> Iterator[Tensor]:
-        return iter((self.loc, self.scale, self.warm))
+    def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> Tensor:
+        """Draw ``a_0 = loc + temperature * scale * eps``, ``[*B, P, d_a]``.
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Draw ``a_0``, ``[*B, P, d_a]``; of PyTorch's global generator by default."""
+        By default PyTorch's global generator draws.
+        """
         loc = self.loc
         like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device}
         if generator is not None:  # torch.compile and torch.export take no argument that is None
@@ -53,7 +60,8 @@ class Source:
             common = torch.randn((*loc.shape[:-2], 1, loc.shape[-1]), **like)
             own, shared = math.sqrt(1.0 - self.correlation), math.sqrt(self.correlation)
             eps = torch.where(self.warm, own * eps + shared * common, eps)
-        return loc + self.scale * eps
+        scale = self.scale if temperature == 1.0 else temperature * self.scale
+        return loc + scale * eps
 
 
 class Prior(Registered):
@@ -99,14 +107,12 @@ class Prior(Registered):
     """``sigma`` where none is given."""
 
     def __init__(self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0) -> None:
-        if chunk_length < 1:
-            raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
+        check_whole_numbers(chunk_length=chunk_length)
         sigma = self.default_sigma if sigma is None else sigma
         check_finite_numbers(sigma=sigma, correlation=correlation)
         if sigma < 0:
             raise ValueError(f"sigma must be a finite number >= 0, got {sigma}")
-        if not 0.0 <= correlation <= 1.0:
-            raise ValueError(f"correlation must be in [0, 1], got {correlation}")
+        check_between(0.0, 1.0, correlation=correlation)
         self.chunk_length = int(chunk_length)
         self.sigma = float(sigma)
         self.correlation = float(correlation)
@@ -131,7 +137,7 @@ class Prior(Registered):
     def distribution(
         self, history: TensorDictBase, observation: Tensor | TensorDictBase | None = None
     ) -> Source:
-        """The source of histories ``[*B]`` (Eq. 1); unpacks into ``loc``, ``scale`` and ``warm``.
+        """Return the source of histories ``[*B]`` (Eq. 1).
 
         The paper's sources ignore the observation, what the network sees, ``[*B, To, d_o]``.
 
@@ -216,9 +222,9 @@ class PastPrior(Prior):
         >>> from warmprior import PastPrior
         >>> from warmprior.history import window_history
         >>> before, target = torch.tensor([[[1.0], [2.0]]]), torch.zeros(1, 2, 1)
-        >>> loc, scale, warm = PastPrior(2).distribution(
+        >>> source = PastPrior(2).distribution(
         ...     window_history(before, torch.tensor([[2]]), target, chunk_length=2))
-        >>> loc.flatten().tolist(), scale.flatten().tolist(), bool(warm.all())
+        >>> source.loc.flatten().tolist(), source.scale.flatten().tolist(), bool(source.warm.all())
         ([1.0, 2.0], [0.5, 0.5], True)
     """
 
@@ -250,9 +256,9 @@ class PreviewPrior(Prior):
         >>> from warmprior import PreviewPrior
         >>> from warmprior.history import advance, cold_history
         >>> chunk = torch.arange(4.0).view(1, 4, 1)
-        >>> loc, scale, warm = PreviewPrior(2).distribution(
+        >>> source = PreviewPrior(2).distribution(
         ...     advance(cold_history([1], 2, 4, 1), chunk, torch.tensor([[2]])))
-        >>> loc.flatten().tolist(), warm.flatten().tolist()
+        >>> source.loc.flatten().tolist(), source.warm.flatten().tolist()
         ([2.0, 3.0, 0.0, 0.0], [True, True, False, False])
     """
 

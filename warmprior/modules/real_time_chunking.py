@@ -106,7 +106,7 @@ class RealTimeChunking:
         """The options, as JSON holds them."""
         return asdict(self)
 
-    def check_delay(self, delay: int, left: int) -> None:
+    def check_reach(self, delay: int, left: int) -> None:
         """A ``ValueError`` if the delay exceeds the horizon, or what is left of the old chunk."""
         if not 0 <= delay <= left:
             raise ValueError(
@@ -151,7 +151,7 @@ class RealTimeChunking:
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
 
         Raises:
-            ValueError: if the shapes do not fit, or see :meth:`check_delay`.
+            ValueError: if the shapes do not fit, or see :meth:`check_reach`.
             RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
         """
         rows, length = leftover.shape[:2]
@@ -164,7 +164,7 @@ class RealTimeChunking:
         if not left.any():
             return velocity
         for late, count in torch.stack([delay, left], 1)[left > 0].unique(dim=0).tolist():
-            self.check_delay(late, count)
+            self.check_reach(late, count)
         weights = self.weights(delay, left, length, leftover.dtype).unsqueeze(-1)
 
         def corrected(t: Tensor, a: Tensor) -> Tensor:

@@ -2,5 +2,13 @@
 
 from warmprior.objectives.couplings import BridgeCoupling, Coupling, OTCoupling, ReflowCoupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
+from warmprior.objectives.self_distillation import SelfDistillationLoss
 
-__all__ = ["BridgeCoupling", "Coupling", "FlowMatchingLoss", "OTCoupling", "ReflowCoupling"]
+__all__ = [
+    "BridgeCoupling",
+    "Coupling",
+    "FlowMatchingLoss",
+    "OTCoupling",
+    "ReflowCoupling",
+    "SelfDistillationLoss",
+]

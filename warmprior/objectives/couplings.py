@@ -11,12 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from warmprior import keys
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.modules.ode import BridgeInterpolant
+from warmprior.modules.interpolant import BridgeInterpolant
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
@@ -202,5 +201,6 @@ class ReflowCoupling:
             if tensor.device != a0.device:
                 self.teacher.to(a0.device)
                 break
-        data = TensorDict({keys.NOISE: a0, ode.in_keys[1]: observation}, a0.shape[:-2])
-        return a0, ode(data, nfe=self.nfe)[keys.CHUNK]
+        noise, *_ = ode.in_keys
+        data = TensorDict({noise: a0, ode.observation_key: observation}, a0.shape[:-2])
+        return a0, ode(data, nfe=self.nfe)[ode.out_keys[0]]

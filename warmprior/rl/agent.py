@@ -225,10 +225,9 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        # Only the buffers of the target critics: the others are the frozen policy and constants.
-        buffers = self.loss.named_buffers()
-        targets = {k: v for k, v in buffers if k.split(".")[0].endswith("_params")}
-        return dict(self.loss.named_parameters()) | targets
+        # Without the frozen policy; and of the buffers only those of the target critics.
+        targets = {k: v for k, v in self.loss.named_buffers() if k.split(".")[0].endswith("_params")}
+        return {k: v for k, v in self.loss.named_parameters() if v.requires_grad} | targets
 
     def state(self) -> dict[str, Tensor]:
         """All that learning has changed, by name, checked: a finite loss may have an infinite gradient."""

@@ -7,11 +7,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from warmprior import keys
 from warmprior.history import check_history, window_history
+from warmprior.modules.checks import check_choice
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
@@ -47,8 +49,8 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
     if actor.start is not None:
         centre = actor.start.centre(history, observation)
         return centre, torch.ones_like(centre[..., :1], dtype=torch.bool)
-    loc, _, warm = actor.prior.distribution(history, observation)
-    return loc, warm
+    source = actor.prior.distribution(history, observation)
+    return source.loc, source.warm
 
 
 def residual_sigma(actor: Any) -> float:
@@ -86,7 +88,7 @@ class PriorAnchor(EnvTransform):
     Args:
         actor: the policy. A learned prior is copied as it is now, and the copy moves with the environment.
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
-            has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
+            has an anchor (:func:`~warmprior.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
 
     Raises:
@@ -112,8 +114,8 @@ class PriorAnchor(EnvTransform):
 
     def __init__(self, actor: Any, *, cold: Literal["noise", "zero"] | None = None) -> None:
         super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
-        if cold not in (None, "noise", "zero"):
-            raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
+        if cold is not None:
+            check_choice("cold", cold, ("noise", "zero"))
         # Copies, so that moving the environment does not move the policy's own.
         self.prior, self.start = (
             copy.deepcopy(part).cpu().requires_grad_(False) if isinstance(part, nn.Module) else part
@@ -121,10 +123,10 @@ class PriorAnchor(EnvTransform):
         )
         self.moves = has_anchor(actor)
         self.cold = cold or ("noise" if self.moves else "zero")
-        self.observation_key = actor.in_keys[0]
+        self.observation_key, self.history_key = actor.observation_key, actor.history_key
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        history = next_tensordict.get(keys.HISTORY, None)
+        history = next_tensordict.get(self.history_key, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
         if self.cold == "noise":
@@ -144,7 +146,8 @@ class PriorAnchor(EnvTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the anchor."""
-        if keys.FORECAST not in observation_spec.keys(True, True):
-            raise KeyError(f"PriorAnchor found no {keys.FORECAST}: append it after ActionHistory")
-        observation_spec[keys.ANCHOR] = observation_spec[keys.FORECAST].clone()
+        forecast = unravel_key((self.history_key, "forecast"))
+        if forecast not in observation_spec.keys(True, True):
+            raise KeyError(f"PriorAnchor found no {forecast}: append it after ActionHistory")
+        observation_spec[keys.ANCHOR] = observation_spec[forecast].clone()
         return observation_spec

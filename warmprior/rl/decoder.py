@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torch.nn.init import trunc_normal_
 from torchrl.data import Bounded, Composite
@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_keys, check_positive
+from warmprior.modules.checks import check_choice, check_keys, check_positive, check_shape
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
@@ -33,9 +33,8 @@ class PriorDecoder(TensorDictModuleBase):
     :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network in
-    evaluation mode, whose parameters are buffers: they move and are saved with the decoder, and never appear
-    in ``parameters()``. ``children()`` is empty, so that nothing switches the network to training mode.
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy, whose parameters
+    take no gradients, and which stays in evaluation mode.
 
     Args:
         actor: the policy; copied. Or an object with the same parts, such as
@@ -58,14 +57,14 @@ class PriorDecoder(TensorDictModuleBase):
         ...     "prior": {"anchor": torch.zeros(5, 4, 2), "delta": torch.full((5, 4, 2), 0.5)}}, [5])
         >>> decoder(data)["vla_action", "chunk"].shape
         torch.Size([5, 4, 2])
-        >>> float(data["prior", "noise"].mean()), list(decoder.parameters())
-        (0.5, [])
+        >>> float(data["prior", "noise"].mean()), any(p.requires_grad for p in decoder.parameters())
+        (0.5, False)
     """
 
     def __init__(self, actor: WarmPriorActor, *, delta: float, nfe: int | None = None) -> None:
         super().__init__()
         check_positive(delta=delta)
-        if actor.ode.max_nfe == 1:
+        if actor.sampling.max_nfe == 1:
             raise ValueError(
                 "the policy is trained at t = 0 alone, so it has no flow from a source space to act in"
             )
@@ -75,14 +74,14 @@ class PriorDecoder(TensorDictModuleBase):
             )
         self.delta = float(delta)
         self.ode = copy.deepcopy(actor.ode)
-        self.nfe = self.ode.nfe if nfe is None else nfe
-        self.ode.check_nfe(self.nfe)
+        actor.sampling.evaluations(nfe)
+        self.nfe = nfe  # the policy's own by default
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
-        _freeze(self)
-        self.observation_key = self.ode.in_keys[1]
+        self.requires_grad_(False).eval()
+        self.observation_key = self.ode.observation_key
         self.in_keys = [self.observation_key, keys.ANCHOR, keys.DELTA]
-        self.out_keys = [keys.NOISE, keys.CHUNK]
+        self.out_keys = [self.ode.in_keys[0], *self.ode.out_keys]
 
     @property
     def network(self) -> nn.Module:
@@ -99,26 +98,21 @@ class PriorDecoder(TensorDictModuleBase):
         """``d_a``, or ``None`` if the network does not say."""
         return getattr(self.ode.network, "action_dim", None)
 
+    @dispatch(auto_batch_size=False)
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the source and the chunk."""
         hint = ". PriorAnchor writes the anchor in an environment and the agent the residual"
         check_keys(tensordict, self.in_keys, "PriorDecoder", hint)
         anchor, delta = tensordict.get(keys.ANCHOR), tensordict.get(keys.DELTA)
-        expected = (self.prediction_length, self.action_dim or anchor.shape[-1])
-        if tuple(anchor.shape[-2:]) != expected:
-            raise ValueError(
-                f"{keys.ANCHOR} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
-                f"[*B, P, d_a] with (P, d_a) = {expected}"
-            )
-        if delta.shape != anchor.shape:
-            raise ValueError(
-                f"{keys.DELTA} has shape {tuple(delta.shape)}, but {keys.ANCHOR} has {tuple(anchor.shape)}"
-            )
+        chunk_shape = (self.prediction_length, self.action_dim or anchor.shape[-1])
+        check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
+        check_shape(str(keys.DELTA), delta, anchor.shape)
         noise = anchor + delta
-        inputs = tensordict.select(*self.in_keys).set(keys.NOISE, noise)
-        chunk = self.ode(inputs, nfe=self.nfe).get(keys.CHUNK)
-        return tensordict.set(keys.NOISE, noise).set(keys.CHUNK, chunk)
+        noise_key, chunk_key = self.out_keys
+        inputs = tensordict.select(*self.in_keys).set(noise_key, noise)
+        chunk = self.ode(inputs, nfe=self.nfe).get(chunk_key)
+        return tensordict.set(noise_key, noise).set(chunk_key, chunk)
 
     def check_env(self, env: EnvBase) -> None:
         """Compare the policy's chunks with those that an environment takes: length and width.
@@ -133,17 +127,9 @@ class PriorDecoder(TensorDictModuleBase):
                 f"the environment takes {list(actions.keys(True, True))}, not {keys.CHUNK}: append "
                 "ChunkStep first"
             )
-        shape = actions[keys.CHUNK].shape
-        expected = (self.prediction_length, self.action_dim or shape[-1])
-        if tuple(shape[-2:]) != expected:
-            raise ValueError(
-                f"the environment takes chunks of (P, d_a) = {tuple(shape[-2:])}, but the policy "
-                f"predicts {expected}"
-            )
-
-    def named_children(self) -> Iterator[tuple[str, nn.Module]]:
-        """None, so that nothing outside changes the policy."""
-        return iter(())
+        *batch, _, width = actions[keys.CHUNK].shape
+        expected = (*batch, self.prediction_length, self.action_dim or width)
+        check_shape("the chunk that the environment takes", actions[keys.CHUNK], expected)
 
     def train(self, mode: bool = True) -> PriorDecoder:
         """Stays in evaluation mode."""
@@ -155,17 +141,6 @@ class PriorDecoder(TensorDictModuleBase):
             if part is not None:
                 part._apply(fn)
         return super()._apply(fn, recurse)
-
-
-def _freeze(module: nn.Module) -> None:
-    """Make every parameter below ``module`` a buffer (tied ones stay tied), in evaluation mode."""
-    frozen: dict[int, Tensor] = {}
-    for child in module.modules():
-        for name, parameter in list(child.named_parameters(recurse=False)):
-            buffer = frozen.setdefault(id(parameter), parameter.detach())
-            delattr(child, name)
-            child.register_buffer(name, buffer)
-        child.train(False)
 
 
 class PriorSpace(EnvTransform):
@@ -293,11 +268,7 @@ class ResidualSampler(TensorDictModuleBase):
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
             distribution = "normal"
-        if distribution not in get_args(ResidualDistribution):
-            raise ValueError(
-                "the distribution must be 'normal', 'clipped', 'truncated' or 'uniform', got "
-                f"{distribution!r}"
-            )
+        check_choice("distribution", distribution, get_args(ResidualDistribution))
         if distribution != "uniform" and sigma == 0:
             raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
         self.distribution = distribution

@@ -19,7 +19,14 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite, check_keys, check_positive, check_whole_numbers
+from warmprior.modules.checks import (
+    check_choice,
+    check_finite,
+    check_finite_numbers,
+    check_keys,
+    check_positive,
+    check_whole_numbers,
+)
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.networks import BoxTanhNormal
 
@@ -74,8 +81,8 @@ class DSRLNALoss(LossModule):
             :func:`~warmprior.make_prior_space_critic`); one module, of which two copies are initialised, or a
             list.
         noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; the same.
-        decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
-            ``loss.to(device)``; ``parameters()`` and target updates never see it.
+        decoder: the frozen policy. It is in the loss's ``state_dict()`` and moves with ``loss.to(device)``;
+            no gradient and no target update reaches it.
         backup_entropy: whether targets include the entropy.
         discount: ``"step"`` discounts by :math:`\gamma^k` for ``k`` executed control steps, with the
             ``gamma`` given to :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma` whatever ``k``,
@@ -157,12 +164,10 @@ class DSRLNALoss(LossModule):
         alpha_init: float = 1.0,
         target_entropy: float = 0.0,
     ) -> None:
-        if discount not in ("step", "decision"):
-            raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
+        check_choice("discount", discount, ("step", "decision"))
         check_whole_numbers(noise_critic_steps=noise_critic_steps)
         check_positive(alpha_init=alpha_init)
-        if not math.isfinite(target_entropy):
-            raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
+        check_finite_numbers(target_entropy=target_entropy)
         _check_networks(actor_network, qvalue_network, noise_qvalue_network, decoder)
         super().__init__()
         self.decoder = decoder

@@ -25,7 +25,8 @@ from warmprior.modules.checks import check_finite
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
-from warmprior.training.evaluation import evaluate, watched
+from warmprior.training.evaluation import evaluate
+from warmprior.training.parallel import watched
 
 
 class ReplaySegments:

@@ -6,42 +6,33 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import exclusive
-from warmprior.io.workers import count_devices
-from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
+from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.objectives.couplings import Coupling
-from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
     data_digest,
     fixed_identity,
     load_state,
-    module_tensors,
     named,
     part_identity,
-    restore_module,
-    restore_optimizer,
     restore_rng,
     restoring,
     rng_tensors,
     save_state,
     select,
-    snapshot_optimizer,
 )
-from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.gradient_step import GradientStep
 from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
@@ -50,7 +41,7 @@ from warmprior.transforms.window import window_replay_buffer
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 
-STATE_FORMAT = 6
+STATE_FORMAT = 7
 """Part of every state's identity; raised whenever the same options give other weights."""
 
 
@@ -132,8 +123,8 @@ class BehaviourCloning:
         prefetch = prefetch or home.type != device.type
         if prefetch:  # what is drawn ahead cannot be drawn by the generator of what follows
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
-        see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
-        observation_key = OBSERVATION if see_history else actor.in_keys[0]
+        see_history = actor.sees_history  # made of the data's observation
+        observation_key = OBSERVATION if see_history else actor.observation_key
         self.replay_buffer = window_replay_buffer(
             data,
             actor.prior,
@@ -145,42 +136,12 @@ class BehaviourCloning:
             observation_key=observation_key,
         )
         self._prefetch = Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
-        #: The network, and the prior where it has weights as well.
-        self.trained = nn.ModuleDict({"network": actor.network})
-        if isinstance(actor.prior, nn.Module):
-            self.trained["prior"] = actor.prior
-        self.ema = ema_of(self.trained, config.ema_rate)
-        self.loss_module = FlowMatchingLoss(
-            actor,
-            coupling=coupling,
-            times=config.times,
-            objective=config.objective,
-            weighting=config.weighting,
-            self_distillation=config.self_distillation,
-            teacher=cast(Any, self.ema.module)["network"],
-            generator=self.generator,
-        )
-        # Without the cache: what the teacher casts without gradients must not be taken for the weights.
-        self._precision = partial(
-            torch.autocast,
-            device.type,
-            torch.bfloat16,
-            enabled=config.precision == "bf16",
-            cache_enabled=False,
-        )
-        self.optimizer = make_optimizer(
-            actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
-        )
-        # A prior that learnt before is fixed by then.
-        prior = actor.prior.parameters() if isinstance(actor.prior, nn.Module) else ()
-        if learning := [parameter for parameter in prior if parameter.requires_grad]:
-            self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
-        self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
+        self.update = GradientStep(actor, config, coupling=coupling, generator=self.generator)
         self.iteration = 0
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": asdict(config) | {"weighting": self.loss_module.weighting},
+            "config": asdict(config) | {"weighting": self.update.loss_module.weighting},
             "prior": part_identity(actor.prior),
             "start": part_identity(actor.start),
             "coupling": part_identity(coupling),
@@ -188,8 +149,8 @@ class BehaviourCloning:
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {
                 "observation_steps": observation_steps,
-                "clip": actor.ode.clip,
-                "max_nfe": actor.ode.max_nfe,
+                "clip": actor.sampling.clip,
+                "max_nfe": actor.sampling.max_nfe,
                 "normalizer": fixed_identity(actor.normalizer),  # data in other units may look alike
             },
             "format": STATE_FORMAT,
@@ -198,14 +159,8 @@ class BehaviourCloning:
         self._differ()
         self._restored: float | None = None  # when the state that was restored had been written
         self._restore()
-        self._graphs = compile and device.type == "cuda"
         if compile:
-            count_devices()
-            mode = "reduce-overhead" if self._graphs else None
-            self.loss_module.velocity_network.compile(mode=mode)
-        self._loss: nn.Module = _Loss(self.loss_module, self.trained)
-        if world_size() > 1:
-            self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
+            self.update.compile()
 
     @property
     def state_path(self) -> Path:
@@ -218,18 +173,9 @@ class BehaviourCloning:
 
     def step(self) -> torch.Tensor:
         """One gradient step; the loss of this process's part of the batch, a detached scalar."""
-        if self._graphs:  # what the graphs of the last step have left may be overwritten
-            torch.compiler.cudagraph_mark_step_begin()
-        batch = self._prefetch() if self._prefetch else self.replay_buffer.sample()
-        with self._precision():
-            loss = self._loss(batch)
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
-        self.schedule.step()
-        self.ema.update_parameters(self.trained)
+        loss = self.update(self._prefetch() if self._prefetch else self.replay_buffer.sample())
         self.iteration += 1
-        return loss.detach()
+        return loss
 
     def run(self, description: str | None = "train", progress: Callable[[int], object] | None = None) -> None:
         """Train to the end; ``progress`` gets the number of iterations, at the start and after each.
@@ -294,10 +240,7 @@ class BehaviourCloning:
 
     def _keep(self) -> None:
         """Keep the policy of this iteration."""
-        averaged, prior = cast(Any, self.ema.module), self.actor.prior
-        prior = averaged["prior"] if isinstance(prior, nn.Module) else prior
-        actor = self.actor.replace(network=averaged["network"], prior=prior)
-        save_policy(actor, self.policy_path(self.iteration))
+        save_policy(self.update.averaged(self.actor), self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
         """Whether the policy of this iteration is on disk and whole."""
@@ -312,7 +255,7 @@ class BehaviourCloning:
         # Before every save and not only before logs: a saved NaN could not be resumed from.
         losses = torch.stack(self._running)
         finite = bool(torch.isfinite(losses).all())
-        if finite and all(bool(torch.isfinite(p).all()) for p in self.trained.parameters()):
+        if finite and all(bool(torch.isfinite(p).all()) for p in self.update.trained.parameters()):
             return
         what = "the weights became NaN or infinite"
         if not finite:
@@ -330,7 +273,7 @@ class BehaviourCloning:
             self._logged = self.iteration, time.monotonic()
             values = {
                 "train/loss": loss,
-                "train/learning_rate": self.schedule.get_last_lr()[0],
+                "train/learning_rate": self.update.schedule.get_last_lr()[0],
                 "train/iterations_per_second": (self.iteration - iteration) / (self._logged[1] - moment),
             }
             try:
@@ -342,9 +285,7 @@ class BehaviourCloning:
 
     def _save(self) -> None:
         tensors = {
-            **named("trained", module_tensors(self.trained)),
-            **named("ema", module_tensors(self.ema)),
-            **named("optimizer", snapshot_optimizer(self.optimizer)),
+            **self.update.state(),
             **named("rng", rng_tensors(self.generator)),
             **({} if self._prefetch is None else {"rng/windows": self._prefetch.state()}),
             "running": torch.stack(self._running) if self._running else torch.empty(0),
@@ -376,16 +317,9 @@ class BehaviourCloning:
         self._restored = written
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
-        restore_module(self.trained, select("trained", tensors))
-        restore_module(self.ema, select("ema", tensors))
-        restore_optimizer(self.optimizer, select("optimizer", tensors))
         self.iteration = facts["iteration"]
         self.losses = [(i, float(loss)) for i, loss in facts["losses"]]
-        self.schedule.last_epoch = self.iteration
-        for group, base, factor in zip(
-            self.optimizer.param_groups, self.schedule.base_lrs, self.schedule.lr_lambdas, strict=True
-        ):
-            group["lr"] = base * factor(self.iteration)
+        self.update.load(tensors, self.iteration)
         self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
         if self._prefetch is not None:
@@ -393,24 +327,6 @@ class BehaviourCloning:
             seed = WINDOWS_SEED + self.config.seed + self.iteration
             self._prefetch.restore(tensors.get("rng/windows", seed))
         self._differ()
-
-
-class _Loss(nn.Module):
-    """The sum of the losses of a batch, as a module of what is trained, whose gradients DDP averages.
-
-    The loss module's own parameters are the same, but named and nested as functional modules need it.
-    """
-
-    loss_module: FlowMatchingLoss
-
-    def __init__(self, loss_module: FlowMatchingLoss, trained: nn.Module) -> None:
-        super().__init__()
-        self.trained = trained
-        self.__dict__["loss_module"] = loss_module
-
-    def forward(self, batch: TensorDictBase) -> Tensor:
-        losses = self.loss_module(batch)
-        return torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
 
 
 def policy_path(directory: Path, iteration: int) -> Path:

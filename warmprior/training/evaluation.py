@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import chain
 from typing import Any, Literal
 
@@ -18,11 +15,13 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import ActionScaling, Compose, ObservationNorm
+from torchrl.envs.transforms import ActionScaling, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.io.workers import end_with_parent, start_method, torch_threads, worker_died
+from warmprior.io.workers import torch_threads
+from warmprior.training.parallel import base_of, watched
+from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
 
 Act = Callable[[TensorDictBase], TensorDictBase]
@@ -89,119 +88,6 @@ class _Tally:
         done[-1] = True
         rollout = TensorDictBase.stack(self._decisions).set(("next", "done"), done)
         return Episode(seed, self._solved, self._steps, rollout, self._values)
-
-
-def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
-    end_with_parent()
-    return TransformedEnv(make_env(), make_transforms())
-
-
-class _StridedEnv(ParallelEnv):
-    """Its workers number their own episodes, see :func:`parallel_env`."""
-
-    strided_seeds = True
-
-
-def parallel_env(
-    make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
-) -> ParallelEnv:
-    """Environments in worker processes, with the policy's transforms inside the workers.
-
-    Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of
-    ``n`` plays the episodes ``i, i + n, i + 2n, ...`` after ``set_seed(seed, static_seed=True)``.
-
-    Args:
-        make_env: called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker, see
-            :class:`~warmprior.envs.RobosuiteEnv`.
-        make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
-        num_envs: number of workers, at least 1.
-
-    Examples:
-        >>> from functools import partial
-        >>> from warmprior import PastPrior, policy_transforms
-        >>> from warmprior.envs import NavigationEnv
-        >>> from warmprior.training import parallel_env
-        >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
-        ...     return NavigationEnv()
-        >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)
-        >>> env = parallel_env(make_env, make_transforms, num_envs=2)
-        >>> env.batch_size, env.is_closed  # the workers start with the first reset
-        (torch.Size([2]), True)
-    """
-    if num_envs < 1:
-        raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
-    workers = [
-        partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
-        for i in range(num_envs)
-    ]
-    # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
-    # take a core from the workers.
-    return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
-
-
-def _base_of(env: EnvBase) -> EnvBase:
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
-
-
-@contextmanager
-def watched(env: EnvBase) -> Iterator[None]:
-    """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
-    base = _base_of(env)
-    if isinstance(base, ParallelEnv) and base.is_closed:
-        base.start()
-    workers = list(base._workers) if isinstance(base, ParallelEnv) else []
-    finished = threading.Event()
-    dead = ""
-    # When it finds a dead worker, TorchRL ends and closes the others, which then answer nothing.
-    closed_by_torchrl = suppress(ValueError)
-
-    def look() -> None:
-        nonlocal dead
-        ended = []
-        for i, worker in enumerate(workers):
-            with closed_by_torchrl:
-                if not worker.is_alive():
-                    ended.append((worker.exitcode == -signal.SIGTERM, i, worker.exitcode))
-        if ended and not dead:  # TorchRL terminates the others: one that ended in another way was the first
-            _, i, code = min(ended)
-            dead = f"worker {i} of {len(workers)} (exit code {code})"
-
-    def watch() -> None:
-        while not finished.wait(0.5):
-            look()
-            if dead:
-                for worker in workers:
-                    with closed_by_torchrl:
-                        worker.terminate()  # closes the pipes that the parent waits on
-                return
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    except BaseException as error:
-        if isinstance(error, (ConnectionError, EOFError)):
-            for worker in workers:  # TorchRL may notice before the process is reaped
-                with closed_by_torchrl:
-                    worker.join(0.2)
-        look()
-        finished.set()
-        # Without this, idle workers would keep the interpreter from exiting.
-        try:
-            env.close(raise_if_closed=False)
-        except Exception:  # closing complains about dead workers itself
-            for worker in workers:
-                with closed_by_torchrl:
-                    worker.terminate()
-        if dead:
-            advice = "run one environment in this process to see its own error"
-            raise worker_died(dead, advice) from error
-        raise
-    finally:
-        finished.set()
-        watcher.join()
 
 
 @contextmanager
@@ -395,7 +281,7 @@ def _play_batched(
     tallies = [_Tally(success, measures) for _ in played]
     with watched(env), _acting(policy, env, policy_seed, nfe) as act:
         env.set_seed(seeds.start, static_seed=True)
-        seed_row = _row_seeding(env)
+        seed_row = row_seeding(env)
         for i in range(min(num_envs, len(seeds))):
             seed_row(i, seeds[i])
         data = env.reset()
@@ -422,38 +308,6 @@ def _play_batched(
                 data = env.reset(data.set("_reset", done.to(home).unsqueeze(-1)))
 
 
-def _row_seeding(env: EnvBase) -> Callable[[int, int], None]:
-    """What to call with a row and the seed of its next episode, before that is reset."""
-    base = _base_of(env)
-    if getattr(type(base), "strided_seeds", False):
-        return lambda row, seed: None
-    if not isinstance(base, (SerialEnv, ParallelEnv)):
-        raise ValueError(
-            f"{type(base).__name__} plays {env.batch_size[0]} episodes at once, and nothing tells which "
-            "seed a row plays: evaluate a single one, or several in a SerialEnv, a ParallelEnv or "
-            "warmprior.training.parallel_env. If its row i plays the seeds seed + i, seed + i + n, ... "
-            "after set_seed(seed, static_seed=True), let its class say strided_seeds = True"
-        )
-
-    for make_env, options in zip(base.create_env_fn, base.create_env_kwargs, strict=True):
-        if _has_offset(make_env) or options.get("seed_offset"):
-            raise ValueError(
-                "an environment built with a seed_offset does not play the seed that it is given: leave it "
-                "out, or build all of them by warmprior.training.parallel_env"
-            )
-    rows = [base[row] for row in range(env.batch_size[0])]
-    return lambda row, seed: rows[row].set_seed(seed, static_seed=True)
-
-
-def _has_offset(make_env: object) -> bool:
-    # Workers cannot be asked: one that lacks the attribute dies.
-    if not isinstance(make_env, partial):
-        return False
-    return bool(make_env.keywords.get("seed_offset")) or any(
-        _has_offset(inner) for inner in (make_env.func, *make_env.args, *make_env.keywords.values())
-    )
-
-
 def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
     known = env.observation_spec.keys(True, True)
     for key in (success, *measures):
@@ -472,7 +326,7 @@ def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
 def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
     """Whether the environment is normalised as the normaliser that the policy keeps says."""
     normalizer = getattr(policy, "normalizer", None)
-    if normalizer is None or isinstance(_base_of(env), SerialEnv | ParallelEnv):
+    if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
         return  # what lies inside of workers cannot be asked
     found: dict[NestedKey, Any] = {}
     while isinstance(env, TransformedEnv):

@@ -15,9 +15,10 @@ from warmprior.modules import (
     VelocityNetwork,
     VisionNetwork,
 )
-from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.modules.checks import check_choice, check_finite_numbers, check_whole_numbers
 from warmprior.modules.encoder import load_imagenet
-from warmprior.objectives.flow_matching import Objective, TimesName, Weighting, check_objective
+from warmprior.objectives.flow_matching import Objective, Weighting
+from warmprior.objectives.times import TimesName
 
 PRETRAINED = "resnet18-imagenet"
 
@@ -64,8 +65,7 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         counts = ("hidden_dim", "observation_steps", "crop_size")
         check_whole_numbers(**{n: value for n in counts if (value := getattr(self, n)) is not None})
-        if self.network not in _NETWORKS:
-            raise ValueError(f"network must be one of {', '.join(_NETWORKS)}, got {self.network!r}")
+        check_choice("network", self.network, _NETWORKS)
 
     def without_images(self) -> NetworkOptions:
         """With the defaults for what has no effect where no images are seen."""
@@ -104,6 +104,13 @@ class NetworkOptions:
 
 
 Precision = Literal["float32", "bf16"]
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "times": get_args(TimesName),
+    "objective": get_args(Objective),
+    "weighting": get_args(Weighting),
+    "precision": get_args(Precision),
+}
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,7 @@ class TrainingConfig:
         for name, words, fits in (
             ("learning_rate", "be > 0", lambda value: value > 0),
             ("weight_decay", "be >= 0", lambda value: value >= 0),
+            ("self_distillation", "be >= 0", lambda value: value >= 0),
             ("warmup_ratio", "lie in [0, 1)", lambda value: 0 <= value < 1),
             ("ema_rate", "lie in [0, 1)", lambda value: 0 <= value < 1),
             ("cold_probability", "lie in [0, 1]", lambda value: 0 <= value <= 1),
@@ -175,15 +183,11 @@ class TrainingConfig:
             check_finite_numbers(**{name: value})
             if not fits(value):
                 raise ValueError(f"{name} must {words}, got {value}")
-        if self.precision not in get_args(Precision):
-            known = ", ".join(get_args(Precision))
-            raise ValueError(f"precision must be one of {known}, got {self.precision!r}")
-        check_objective(
-            times=self.times,
-            objective=self.objective,
-            weighting=self.weighting,
-            self_distillation=self.self_distillation,
-        )
+        for name, choices in CHOICES.items():
+            if getattr(self, name) is not None:
+                check_choice(name, getattr(self, name), choices)
+        if self.self_distillation and self.times == "start":
+            raise ValueError("self_distillation needs a flow, and times = 'start' trains none")
 
     @property
     def checkpoint_iterations(self) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from itertools import chain
@@ -24,7 +25,7 @@ from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
 from warmprior.training.checkpoint import load_state, save_state
 
-FORMAT = 6
+FORMAT = 7
 """Version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
@@ -101,13 +102,9 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         "start": None if actor.start is None else actor.start.config(),
         "network": network.config(),
         "actor": {
-            "nfe": actor.ode.nfe,
-            "solver": actor.ode.solver,
-            "grid": actor.ode.grid,
-            "clip": actor.ode.clip,
-            "max_nfe": actor.ode.max_nfe,
+            **asdict(actor.sampling),
+            **actor.tensor_keys,
             "guidance": None if guidance is None else guidance.config(),
-            "observation_key": actor.in_keys[0],
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
@@ -317,8 +314,9 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     """An actor with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
-    key = options["observation_key"]
-    options["observation_key"] = tuple(key) if isinstance(key, list) else key  # nested, as JSON holds it
+    for name, value in options.items():
+        if name.endswith("_key") and isinstance(value, list):  # a nested key, as JSON holds it
+            options[name] = tuple(value)
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]

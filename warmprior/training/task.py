@@ -63,8 +63,8 @@ class Task:
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> task = Task.of("pendulum", TensorDict(steps, [60]), lambda: GymEnv("Pendulum-v1"))
-        >>> task.title, round(task.data["action"].amax().item(), 3), task.facts["demonstrations"]
-        ('pendulum human', 1.0, 3)
+        >>> round(task.data["action"].amax().item(), 3), task.facts["demonstrations"]
+        (1.0, 3)
     """
 
     name: str
@@ -187,8 +187,8 @@ class Task:
 
         Examples:
             >>> from warmprior.training import Task
-            >>> Task.from_file("square.hdf5", mask="train").title  # doctest: +SKIP
-            'square ph'
+            >>> Task.from_file("square.hdf5", mask="train").name  # doctest: +SKIP
+            'square'
         """
         # Here, since training on a TensorDict needs no reader and no simulator.
         from warmprior.data.images import renderer_versions
@@ -272,17 +272,6 @@ class Task:
         return digest_of(data, {key: value.tolist() for key, value in units.items()})
 
     @property
-    def title(self) -> str:
-        """Task, style and what is unusual, for figures."""
-        source = self.facts.get("source")
-        words = {"actions": "actions", "obs": "observations"}
-        parts = [f"{self.name} {self.style}" + (f" ({source} data)" if source else "")]
-        parts += [f"{value} {words[key]}" for key, value in self.space.items()]
-        if (self.facts.get("images") or {}).get("fast_rendering"):
-            parts.append("rendered fast")
-        return ", ".join(parts)
-
-    @property
     def vector(self) -> Tensor:
         """The observation, or its vector if it has images, ``[N, d]``."""
         observation = self.data[OBSERVATION]
@@ -295,16 +284,6 @@ class Task:
         if not isinstance(observation, TensorDictBase):
             return {}
         return {name: int(value.shape[-1]) for name, value in observation.items() if name != STATE}
-
-    @property
-    def space(self) -> dict[str, str]:
-        """The spaces of actions and observations, where they are not the recorded one and the state."""
-        return {key: self.facts[key] for key in ("actions", "obs") if key in self.facts}
-
-    @property
-    def longest(self) -> int:
-        """Steps of the longest demonstration."""
-        return int(self.data[EPISODE].flatten().bincount().max())
 
 
 def _no_environment() -> EnvBase:

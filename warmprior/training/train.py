@@ -16,8 +16,8 @@ from warmprior import keys
 from warmprior.io.distributed import from_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
+from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.ode import Interpolant
 from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.objectives.couplings import Coupling
@@ -63,10 +63,10 @@ def new_policy(
         prior,
         start=start,
         max_nfe=max_nfe,
+        clip=task.clip,
         observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
         # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
         normalizer=copy.deepcopy(task.normalizer),
-        clip=task.clip,
         environment=task.environment,
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -41,16 +41,12 @@ class LateTransforms:
 
     A decision of ``k`` control steps is read once, at its end; transforming all observations only to discard
     most costs more than anything else here beside a fast simulator. The result equals that of transforming
-    every step, bit by bit.
-
-    An environment without batch dimensions may offer ``control_steps(actions, keep)``, as
-    :class:`~warmprior.envs.RobosuiteEnv` does, which takes all steps in one call and doubles the speed. It is
-    used where actions can be inverted at once and only reward and flags of the first steps are read
-    (``brief``).
+    every step, bit by bit. The environment's own ``control_steps`` (see :class:`ChunkStep`) is used where
+    actions can be inverted at once and only reward and flags of the first steps are read (``brief``).
     """
 
-    def __init__(self, step: InnerStep, brief: bool) -> None:
-        self._step = step
+    def __init__(self, step: InnerStep, action_key: NestedKey, brief: bool) -> None:
+        self._step, self._action_key = step, action_key
         self._transforms = step.transforms
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
         # Actions are inverted from the last transform to the first: those after the last one that looks at
@@ -63,21 +59,24 @@ class LateTransforms:
             self._control_steps = _control_steps(step.base)
 
     @classmethod
-    def of(cls, step: InnerStep, read: Iterable[NestedKey]) -> LateTransforms | None:
-        """Such steps, or ``None`` where ``read`` needs every transform to run at every step."""
+    def of(
+        cls, step: InnerStep, read: Iterable[NestedKey], action_keys: Sequence[NestedKey]
+    ) -> LateTransforms | None:
+        """Return such steps, or ``None`` where ``read`` needs every transform to run at every step."""
         transforms, base = step.transforms, step.base
         # An environment reads its action and states alone: other observations may reach it untransformed.
         # A transformed one has transforms of its own, which may read what these write.
-        if isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
+        (action_key, *others) = action_keys
+        if others or isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
         looked_at = [keys.EEF_POSE for t in transforms if isinstance(t, AbsoluteActions)]
-        needed = _roots([keys.ACTION, *read, *looked_at, *base.state_spec.keys(True, True)])
+        needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
         inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
-        if written & needed or any(ends not in ([], [keys.ACTION]) for pair in inverse for ends in pair):
+        if written & needed or any(ends not in ([], [action_key]) for pair in inverse for ends in pair):
             return None
         brief = {*base.reward_keys, *base.done_keys, keys.SUCCESS}
-        return cls(step, brief.issuperset(read))
+        return cls(step, action_key, brief.issuperset(read))
 
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
@@ -101,11 +100,11 @@ class LateTransforms:
         """One step after the other, untransformed."""
         results: list[TensorDictBase] = []
         for action in actions.unbind(0):
-            advance(current, results[-1] if results else first, reward_key)
+            update_input(current, results[-1] if results else first, reward_key)
             if current["done"].any():
                 break
             # Without the constructor's checks: the entries come out of tensordicts of this batch size.
-            entries = current | {keys.ACTION: action}
+            entries = current | {self._action_key: action}
             inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
             for transform in reversed(self._one_by_one):
                 inputs = transform._inv_call(inputs)
@@ -136,7 +135,7 @@ def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase
     return getattr(base, "control_steps", None) if same else None
 
 
-def advance(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
+def update_input(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
     """A lean ``step_mdp``, in place and without the reward: it runs at every control step."""
     for key, value in next_tensordict.items():
         # The type first: nearly all are plain tensors, and the instance check is slow.
@@ -166,6 +165,12 @@ class ChunkStep(EnvTransform):
     the steps that a chunk's last observation depends on. In a partial step, resting rows keep all
     observations.
 
+    An environment without batch dimensions may take all steps of a chunk in one call, as
+    :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It then has a method
+    ``control_steps(actions, keep)``, defined in the class that defines ``_step``: it takes raw actions
+    ``[n, d_a]`` until the episode ends, and returns a tensordict per step, the last ``keep`` of them as
+    ``_step`` returns them, the earlier ones with reward, flags and ``"success"`` alone.
+
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
         ``VecNormV2``, update it in all rows, also in those that a partial step leaves out. If rows rest for
@@ -181,11 +186,15 @@ class ChunkStep(EnvTransform):
             the environment does not write it.
         measures: further keys whose values after a chunk are the ``"max"``, ``"sum"`` or ``"last"`` of those
             after its executed steps.
+        action_keys: the environment's actions, vectors ``[*B, d_a]``, or ``[*B, n, d_a]`` of the ``n`` agents
+            of a group.
+        chunk_keys: the chunks in their place, ``[*B, P, d_a]`` or ``[*B, n, P, d_a]``. Several policies, or
+            agents, act in one environment by keys of their own.
 
     Raises:
-        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or an action is not one
-            vector.
-        KeyError: (in an environment) if there is no such action.
+        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
+            or keys are not as many.
+        KeyError: (in an environment) if there is no such action, or another one that nobody would choose.
         RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, or is
             a vector environment of Gymnasium.
 
@@ -209,8 +218,15 @@ class ChunkStep(EnvTransform):
         gamma: float = 1.0,
         success: NestedKey = keys.SUCCESS,
         measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        action_keys: Sequence[NestedKey] = (keys.ACTION,),
+        chunk_keys: Sequence[NestedKey] = (keys.CHUNK,),
     ) -> None:
-        super().__init__(in_keys_inv=[keys.ACTION], out_keys_inv=[keys.CHUNK])
+        super().__init__(
+            in_keys_inv=[unravel_key(key) for key in action_keys],
+            out_keys_inv=[unravel_key(key) for key in chunk_keys],
+        )
+        if not len(action_keys) == len(chunk_keys) > 0:
+            raise ValueError(f"need a chunk_key per action_key, got {chunk_keys} for {action_keys}")
         execute = chunk_length if execute is None else execute
         prediction_length = chunk_length if prediction_length is None else prediction_length
         check_whole_numbers(chunk_length=chunk_length, execute=execute)
@@ -231,18 +247,26 @@ class ChunkStep(EnvTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
-        chunk = tensordict.get(keys.CHUNK)
-        if chunk is None or chunk.shape[-2] != self.prediction_length:
-            found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
-            raise ValueError(
-                f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at "
-                f"{keys.CHUNK}, found {found}"
-            )
+        chunks = self._chunks(tensordict)
         # Inverse transforms of the environment below may change it before _step gets it.
         self._input = tensordict.copy()
         if "_step" in tensordict:
             set_aside(tensordict, self._inner_step()[0].observed)
-        return tensordict.set(keys.ACTION, chunk[..., 0, :])
+        for key, chunk in chunks.items():
+            tensordict.set(key, chunk[..., 0, :])
+        return tensordict
+
+    def _chunks(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Return the chunks of a decision by the keys of their actions."""
+        chunks = {}
+        for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
+            chunks[action_key] = chunk = tensordict.get(chunk_key)
+            if chunk is None or chunk.shape[-2] != self.prediction_length:
+                raise ValueError(
+                    f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at {chunk_key}, found "
+                    f"{'nothing' if chunk is None else tuple(chunk.shape)}"
+                )
+        return chunks
 
     def _inner_step(self) -> tuple[InnerStep, LateTransforms | None, NestedKey]:
         """How to step what this transform wraps, also with late transforms, and the key of its reward."""
@@ -268,7 +292,7 @@ class ChunkStep(EnvTransform):
                     "episode that ends inside a chunk, and the rest of the chunk would be played in the next "
                     "one. Use SerialEnv or ParallelEnv of single environments"
                 )
-            late = LateTransforms.of(inner, read)
+            late = LateTransforms.of(inner, read, self.in_keys_inv)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
 
@@ -278,7 +302,7 @@ class ChunkStep(EnvTransform):
         before, self._input = self._input, None
         if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
-        chunk = before.get(keys.CHUNK)[..., : self.execute, :]
+        chunks = self._chunks(before)
         # A plain dictionary: a tensordict's checks would be made at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
@@ -290,11 +314,12 @@ class ChunkStep(EnvTransform):
             next_tensordict = rows_where(alive, next_tensordict, before)
         results = [next_tensordict]
         if alive is None and late is not None:
-            results = late(current, next_tensordict, chunk[..., 1:, :], reward_key)
+            (chunk,) = chunks.values()
+            results = late(current, next_tensordict, chunk[..., 1 : self.execute, :], reward_key)
             next_tensordict = results[-1]
         earned = [result.get(reward_key) for result in results]
         ran = [alive] * len(results)  # which rows made each of these steps
-        steps = torch.full(batch, len(results), dtype=torch.int64, device=chunk.device)
+        steps = torch.full(batch, len(results), dtype=torch.int64, device=next_tensordict.device)
         steps = steps if alive is None else alive.long()
         for i in range(len(results), self.execute):
             done = next_tensordict.get("done")
@@ -303,9 +328,11 @@ class ChunkStep(EnvTransform):
                 alive = running if alive is None else alive & running
             if alive is not None and not alive.any():
                 break
-            advance(current, next_tensordict, reward_key)
+            update_input(current, next_tensordict, reward_key)
             inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
-            result = step(inputs.set(keys.ACTION, chunk[..., i, :]), alive)
+            for key, chunk in chunks.items():
+                inputs.set(key, chunk[..., i, :])
+            result = step(inputs, alive)
             reward = result.get(reward_key)
             if alive is None:
                 next_tensordict = result
@@ -352,24 +379,26 @@ class ChunkStep(EnvTransform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action by a chunk of ``P`` actions."""
-        actions, ndim = input_spec["full_action_spec"], input_spec.ndim
-        if keys.ACTION not in actions.keys(True, True):
+        actions = input_spec["full_action_spec"]
+        present = set(actions.keys(True, True))
+        if present != set(self.in_keys_inv):
             raise KeyError(
-                f"ChunkStep found no {keys.ACTION!r}, only {list(actions.keys(True, True))}: rename it with "
-                "TorchRL's RenameTransform"
+                f"the environment takes the actions {sorted(map(str, present))}, and ChunkStep has "
+                f"action_keys {self.in_keys_inv}: name all of them, with a chunk_key each"
             )
-        leaf = actions[keys.ACTION]
-        if leaf.ndim != ndim + 1:
-            raise ValueError(
-                "ChunkStep takes environments whose action is one vector [*B, d_a], but "
-                f"{keys.ACTION!r} has shape {tuple(leaf.shape)} for the batch size "
-                f"{tuple(input_spec.shape)}: make it a vector before, for instance with FlattenAction or "
-                "UnsqueezeTransform"
-            )
-        leaf = leaf.unsqueeze(ndim)
-        leaf = leaf.expand(*leaf.shape[:ndim], self.prediction_length, *leaf.shape[ndim + 1 :])
-        actions[keys.CHUNK] = leaf.clone()
-        del actions[keys.ACTION]
+        for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
+            leaf = actions[action_key]
+            if leaf.ndim <= input_spec.ndim:
+                raise ValueError(
+                    f"ChunkStep takes actions that are vectors [*B, d_a], but {action_key!r} has shape "
+                    f"{tuple(leaf.shape)} for the batch size {tuple(input_spec.shape)}: make it a vector "
+                    "before, for instance with UnsqueezeTransform"
+                )
+            *agents, width = leaf.shape
+            del actions[action_key]
+            if isinstance(action_key, tuple) and actions[action_key[0]].is_empty():
+                del actions[action_key[0]]  # it would count as an action
+            actions[chunk_key] = leaf.unsqueeze(-2).expand(*agents, self.prediction_length, width).clone()
         return input_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from numbers import Integral
-
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from warmprior import keys
+from warmprior.modules.checks import check_keys, check_whole_numbers
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
     """A ``ValueError`` if chunks of ``length`` cannot take effect ``delay`` control steps late."""
-    if isinstance(delay, bool) or not isinstance(delay, Integral) or delay < 0:
-        raise ValueError(f"a delay is a whole number of control steps, at least 0, got {delay!r}")
+    check_whole_numbers(0, delay=delay)
     if length is not None and 2 * delay > length:
         raise ValueError(
             f"a delay of {delay} control steps is too long for predictions of {length} actions: at most "
@@ -25,8 +24,8 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         )
     if delay > execute:
         raise ValueError(
-            f"a delay of {delay} control steps does not fit {execute} actions per decision: need 0 <= delay "
-            "<= execute, or the next decision is due before the last one takes effect"
+            f"a delay of {delay} control steps needs at least {delay} actions per decision, got {execute}: "
+            "the next decision would be due before the last one takes effect"
         )
     if length is not None and execute + delay > length:
         raise ValueError(
@@ -35,10 +34,12 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         )
 
 
-def executed_chunk(tensordict: TensorDictBase) -> Tensor:
-    """The chunks of decisions ``[*B]`` as they are executed: a late one begins with the rest of the last.
+def executed_chunk(
+    tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK, history_key: NestedKey = keys.HISTORY
+) -> Tensor:
+    """Return the chunks of decisions ``[*B]`` as they are executed.
 
-    Without a recorded delay they are executed as they are.
+    A late one begins with the rest of the last; without a recorded delay they are executed as they are.
 
     Examples:
         >>> import torch
@@ -52,8 +53,9 @@ def executed_chunk(tensordict: TensorDictBase) -> Tensor:
     """
     delay = tensordict.get(keys.DELAY, None)
     if delay is None:
-        return tensordict.get(keys.CHUNK)
-    return with_leftover(tensordict.get(keys.CHUNK), tensordict.get(keys.FORECAST), delay)
+        return tensordict.get(chunk_key)
+    forecast = tensordict.get(unravel_key((history_key, "forecast")))
+    return with_leftover(tensordict.get(chunk_key), forecast, delay)
 
 
 class InferenceDelay(EnvTransform):
@@ -71,6 +73,8 @@ class InferenceDelay(EnvTransform):
     Args:
         delay: ``d``, control steps until a chunk takes effect.
         execute: actions executed per decision, as :class:`ChunkStep` has it.
+        chunk_key: key of the chunk.
+        history_key: key of the history.
 
     Raises:
         ValueError: if not ``0 <= delay <= execute`` (the next decision would be due before the last one took
@@ -92,22 +96,27 @@ class InferenceDelay(EnvTransform):
         (True, True)
     """
 
-    def __init__(self, delay: int, *, execute: int) -> None:
-        super().__init__(in_keys=[keys.FORECAST], out_keys=[keys.DELAY])
+    def __init__(
+        self,
+        delay: int,
+        *,
+        execute: int,
+        chunk_key: NestedKey = keys.CHUNK,
+        history_key: NestedKey = keys.HISTORY,
+    ) -> None:
+        super().__init__(in_keys=[unravel_key((history_key, "forecast"))], out_keys=[keys.DELAY])
         check_delay(delay, execute)
+        self.chunk_key, self.history_key = chunk_key, history_key
         self.delay = delay
         self.execute = execute
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        missing = [k for k in (keys.FORECAST, keys.DELAY) if tensordict.get(k, None) is None]
-        if missing:
-            raise KeyError(
-                f"InferenceDelay found no {missing} in a step's input: hand over what the reset or the step "
-                "before gave, with the chunk"
-            )
-        if tensordict.get(keys.CHUNK, None) is None:
+        needed = (*self.in_keys, keys.DELAY)
+        check_keys(tensordict, needed, "InferenceDelay", ". Hand over what the reset or the step before gave")
+        if tensordict.get(self.chunk_key, None) is None:
             return tensordict  # ChunkStep raises
-        return tensordict.set(keys.CHUNK, executed_chunk(tensordict))
+        executed = executed_chunk(tensordict, self.chunk_key, self.history_key)
+        return tensordict.set(self.chunk_key, executed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         executed = next_tensordict.get(keys.EXECUTED)
@@ -126,9 +135,10 @@ class InferenceDelay(EnvTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the delay."""
-        if keys.FORECAST not in observation_spec.keys(True, True):
-            raise KeyError(f"InferenceDelay found no {keys.FORECAST}: append it after ActionHistory")
-        check_delay(self.delay, self.execute, observation_spec[keys.FORECAST].shape[-2])
+        (forecast,) = self.in_keys
+        if forecast not in observation_spec.keys(True, True):
+            raise KeyError(f"InferenceDelay found no {forecast}: append it after ActionHistory")
+        check_delay(self.delay, self.execute, observation_spec[forecast].shape[-2])
         observation_spec[keys.DELAY] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
         )

@@ -6,18 +6,16 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.history import ENTRIES, advance, cold_history, without
-from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.history import advance, cold_history, history_keys, without
+from warmprior.modules.checks import check_between, check_finite_numbers, check_keys, check_whole_numbers
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
-
-HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 
 
 class ActionHistory(EnvTransform):
@@ -29,6 +27,9 @@ class ActionHistory(EnvTransform):
 
     Args:
         history_length: how many executed actions are remembered, usually ``H``.
+        chunk_key: key of the executed chunk.
+        history_key: where the history is written; with keys of their own, several policies share an
+            environment.
 
     Raises:
         ValueError: if ``history_length < 1``.
@@ -45,10 +46,16 @@ class ActionHistory(EnvTransform):
         True
     """
 
-    def __init__(self, history_length: int) -> None:
-        super().__init__(in_keys=[keys.CHUNK], out_keys=HISTORY_KEYS)
+    def __init__(
+        self,
+        history_length: int,
+        *,
+        chunk_key: NestedKey = keys.CHUNK,
+        history_key: NestedKey = keys.HISTORY,
+    ) -> None:
+        super().__init__(in_keys=[unravel_key(chunk_key)], out_keys=history_keys(history_key))
         check_whole_numbers(history_length=history_length)
-        self.history_length = history_length
+        self.history_length, self.history_key = history_length, unravel_key(history_key)
         self._chunk: TensorSpec | None = None
 
     def set_container(self, container: Transform | EnvBase) -> None:
@@ -57,47 +64,51 @@ class ActionHistory(EnvTransform):
         self._chunk = None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        history = tensordict.get(keys.HISTORY, None)
+        history = tensordict.get(self.history_key, None)
         if history is None:
             raise KeyError(
-                f"ActionHistory found no {keys.HISTORY!r} in a step's input: hand over what the reset or the "
-                "step before gave, with the chunk"
+                f"ActionHistory found no {self.history_key!r} in a step's input: hand over what the reset or "
+                "the step before gave, with the chunk"
             )
         executed = next_tensordict.get(keys.EXECUTED)
         if executed is None:
             raise KeyError(
                 f"ActionHistory found no {keys.EXECUTED!r} after the step: append it after ChunkStep"
             )
-        moved = advance(history, tensordict.get(keys.CHUNK), executed)
-        next_tensordict.set(keys.HISTORY, moved)
+        if history.ndim > next_tensordict.ndim:  # agents of a group, which execute alike
+            executed = expand_as_right(executed.squeeze(-1), history["steps"])
+        moved = advance(history, tensordict.get(self.in_keys[0]), executed)
+        next_tensordict.set(self.history_key, moved)
         # The others' chunks were not executed.
-        return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
+        return keep_resting(tensordict, next_tensordict, self.out_keys)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         chunk = self._chunk or self._check_chunk()
-        return tensordict_reset.set(keys.HISTORY, self._cold(chunk, tensordict_reset))
+        return tensordict_reset.set(self.history_key, self._cold(chunk, tensordict_reset))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the history."""
         for name, value in self._cold(self._check_chunk(), observation_spec).items():
             spec = Unbounded(value.shape, dtype=value.dtype, device=observation_spec.device)
-            observation_spec[keys.HISTORY, name] = spec
+            observation_spec[unravel_key((self.history_key, name))] = spec
         return observation_spec
 
     def _cold(self, chunk: TensorSpec, place: TensorDictBase | TensorSpec) -> TensorDictBase:
-        lengths, like = (self.history_length, *chunk.shape[-2:]), {"device": place.device}
-        return cold_history(place.shape, *lengths, dtype=chunk.dtype, **like)
+        agents = chunk.shape[len(place.shape) : -2]  # of a group, where there is one
+        dtype = chunk.dtype if chunk.dtype.is_floating_point else torch.get_default_dtype()
+        lengths, like = (self.history_length, *chunk.shape[-2:]), {"dtype": dtype, "device": place.device}
+        return cold_history((*place.shape, *agents), *lengths, **like)
 
     def _check_chunk(self) -> TensorSpec:
         actions = self.parent.full_action_spec
-        if keys.CHUNK not in actions.keys(True, True):
+        if self.in_keys[0] not in actions.keys(True, True):
             raise KeyError(
-                f"ActionHistory found no {keys.CHUNK} among the actions "
+                f"ActionHistory found no {self.in_keys[0]} among the actions "
                 f"{list(actions.keys(True, True))}: append it after ChunkStep"
             )
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
-        self._chunk = actions[keys.CHUNK]
+        self._chunk = actions[self.in_keys[0]]
         return self._chunk
 
 
@@ -130,8 +141,7 @@ class WithheldHistory(Transform):
     def __init__(self, probability: float, *, generator: torch.Generator | None = None) -> None:
         super().__init__(in_keys=[keys.HISTORY], out_keys=[keys.HISTORY])
         check_finite_numbers(probability=probability)
-        if not 0.0 <= probability <= 1.0:
-            raise ValueError(f"probability must be in [0, 1], got {probability}")
+        check_between(0.0, 1.0, probability=probability)
         self.probability = probability
         self.generator = generator
 
@@ -161,6 +171,7 @@ class HistoryObservation(EnvTransform):
     Args:
         observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
             vector ``"state"`` is extended.
+        history_key: key of the history.
 
     Raises:
         KeyError: if an input key is missing.
@@ -176,8 +187,10 @@ class HistoryObservation(EnvTransform):
         (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
     """
 
-    def __init__(self, *, observation_key: NestedKey = keys.OBSERVATION) -> None:
-        read = [unravel_key(observation_key), keys.ACTIONS, keys.STEPS]
+    def __init__(
+        self, *, observation_key: NestedKey = keys.OBSERVATION, history_key: NestedKey = keys.HISTORY
+    ) -> None:
+        read = [unravel_key(observation_key), *history_keys(history_key)[:2]]
         super().__init__(in_keys=read, out_keys=[keys.CONDITIONED])
 
     @staticmethod
@@ -200,13 +213,9 @@ class HistoryObservation(EnvTransform):
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
         """The values or specs under the input keys."""
-        known = place.keys(True)
-        missing = [key for key in self.in_keys if key not in known]
-        if missing:
-            raise KeyError(
-                f"HistoryObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
-                "append it after ActionHistory"
-            )
+        check_keys(
+            place, self.in_keys, "HistoryObservation", ". In an environment append it after ActionHistory"
+        )
         return [place[key] for key in self.in_keys]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

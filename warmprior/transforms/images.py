@@ -124,7 +124,7 @@ class EncodeObservation(EnvTransform):
     """
 
     def __init__(self, actor: WarmPriorActor) -> None:
-        observation_key = unravel_key(actor.in_keys[0])
+        observation_key = unravel_key(actor.observation_key)
         super().__init__(in_keys=[observation_key], out_keys=[keys.FEATURES])
         if not getattr(actor.network, "encodes", False):
             raise ValueError(

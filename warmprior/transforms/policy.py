@@ -31,6 +31,7 @@ def policy_transforms(
     gamma: float = 1.0,
     see_history: bool | None = None,
     observation_key: NestedKey | None = None,
+    action_key: NestedKey = keys.ACTION,
     success: NestedKey = keys.SUCCESS,
     measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
 ) -> Compose:
@@ -55,7 +56,8 @@ def policy_transforms(
             policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
         gamma: discount per control step inside a chunk.
         see_history: whether the network sees the last actions; as in the policy by default.
-        observation_key: the policy's by default.
+        observation_key: the policy's by default, as are the keys of history and chunk.
+        action_key: the environment's action.
         success: see :class:`ChunkStep`.
         measures: see :class:`ChunkStep`.
 
@@ -72,10 +74,11 @@ def policy_transforms(
         torch.Size([2, 3])
     """
     policy = cast(Any, uncompiled(cast(Any, policy)))
-    prior = policy
+    prior, history_key, chunk_key = policy, keys.HISTORY, keys.CHUNK
     if isinstance(policy, WarmPriorActor):
-        prior, observed = policy.prior, policy.in_keys[0]
-        sees_history = observed == keys.CONDITIONED  # made of the observation under its usual key
+        prior, observed = policy.prior, policy.observation_key
+        history_key, chunk_key = policy.history_key, policy.tensor_keys["chunk_key"]
+        sees_history = policy.sees_history  # made of the observation under its usual key
         normalizer = normalizer or policy.normalizer
         observation_key = observation_key or (None if sees_history else observed)
         see_history = sees_history if see_history is None else see_history
@@ -87,18 +90,19 @@ def policy_transforms(
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps
     observation_key = observation_key or keys.OBSERVATION
-    if normalizer is not None and keys.ACTION not in normalizer.keys:
+    if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
-            f"the normaliser has {normalizer.keys}, but not the environment's action {keys.ACTION!r}: fit it "
+            f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: fit it "
             "to data with that key"
         )
     late: list[Transform] = []
-    seen = [HistoryObservation(observation_key=observation_key)] if see_history else []
+    if see_history:
+        late.append(HistoryObservation(observation_key=observation_key, history_key=history_key))
     if delay is not None:
         if execute is None:
             execute = min(prior.chunk_length, prior.prediction_length - delay)
         check_delay(delay, execute, prior.prediction_length)
-        late = [InferenceDelay(delay, execute=execute)]
+        late.append(InferenceDelay(delay, execute=execute, chunk_key=chunk_key, history_key=history_key))
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
     per_step += [] if normalizer is None else normalizer.env_transforms()
     return Compose(
@@ -111,8 +115,9 @@ def policy_transforms(
             gamma=gamma,
             success=success,
             measures=measures,
+            action_keys=[action_key],
+            chunk_keys=[chunk_key],
         ),
-        ActionHistory(prior.history_length),
-        *seen,
+        ActionHistory(prior.history_length, chunk_key=chunk_key, history_key=history_key),
         *late,
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from warmprior import keys
+from warmprior.modules.checks import check_whole_numbers
 from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
 
@@ -42,8 +43,7 @@ class ObservationStack(EnvTransform):
 
     def __init__(self, steps: int, *, observation_key: NestedKey = keys.OBSERVATION) -> None:
         super().__init__(in_keys=[observation_key], out_keys=[observation_key])
-        if steps < 1:
-            raise ValueError(f"an observation stack needs at least 1 step, got {steps}")
+        check_whole_numbers(steps=steps)
         self.steps = steps
         self.observation_key = unravel_key(observation_key)
 
@@ -64,7 +64,7 @@ class ObservationStack(EnvTransform):
         return stack
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        time = next_tensordict.ndim
+        time = self._time(next_tensordict)
         newest = next_tensordict.get(self.observation_key)
         rows = tensordict.get("_step", None)
         if self.steps == 1 and rows is None:
@@ -82,13 +82,19 @@ class ObservationStack(EnvTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._check_key(tensordict_reset)
-        time = tensordict_reset.ndim
+        time = self._time(tensordict_reset)
         # Rows that were not reset keep their stack: TorchRL merges only the others.
         stack = _each(
             lambda first: torch.stack([first] * self.steps, dim=time),
             tensordict_reset.get(self.observation_key),
         )
         return tensordict_reset.set(self.observation_key, stack)
+
+    def _time(self, place: TensorDictBase | Composite) -> int:
+        """Return the stack's dimension: behind those of the batch, and of a group's agents."""
+        if isinstance(self.observation_key, tuple):
+            place = place[unravel_key(self.observation_key[:-1])]
+        return place.ndim
 
     def _check_key(self, observations: TensorDictBase | Composite) -> None:
         if self.observation_key not in observations.keys(True):
@@ -100,7 +106,7 @@ class ObservationStack(EnvTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Insert the stack's dimension after those of the batch."""
         self._check_key(observation_spec)
-        time = observation_spec.ndim
+        time = self._time(observation_spec)
         spec = observation_spec[self.observation_key]
         leaves = spec.items(True, True) if isinstance(spec, Composite) else [((), spec)]
         for key, leaf in list(leaves):

@@ -45,18 +45,18 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         raise FileExistsError(f"{out} exists: choose another folder")
     actor = load_policy(folder)
     described = actor.environment or {}
-    sees_history = actor.in_keys[0] == keys.CONDITIONED
+    sees_history = actor.sees_history
     if sees_history or "images" in described or "actions" in described:
         raise ValueError(
             f"{folder}: policies of images, absolute actions or observed last actions need what stands "
             "beside the environment here; only policies of states and pose deltas can be exported"
         )
-    if actor.normalizer is None or actor.ode.clip != 1.0:
+    if actor.normalizer is None or actor.sampling.clip != 1.0:
         raise ValueError(
             f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
-            f"{actor.ode.clip}), which are those of LeRobot's policy"
+            f"{actor.sampling.clip}), which are those of LeRobot's policy"
         )
-    sampler = actor.ode.solver, actor.ode.grid, actor.ode.guidance, actor.start
+    sampler = actor.sampling.solver, actor.sampling.grid, actor.ode.guidance, actor.start
     if sampler != ("euler", "uniform", None, None):
         raise ValueError(
             f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, from the "
@@ -85,7 +85,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         n_obs_steps=network.observation_steps,
         n_action_steps=prior.chunk_length,
         prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in options.items())]),
-        nfe=actor.ode.nfe,
+        nfe=actor.sampling.evaluations(),
         network=json.dumps(network.config()),
         precondition=isinstance(network, PreconditionedNetwork),
         device="cpu",

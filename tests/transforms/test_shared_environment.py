@@ -1,0 +1,151 @@
+"""Several policies, and the agents of a group, in one environment, by keys of their own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import CountingEnv
+from warmprior import (
+    ActionHistory,
+    ChunkStep,
+    GaussianPrior,
+    ObservationStack,
+    PastPrior,
+    PreviewPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+)
+
+H, LENGTH = 3, 7
+
+
+class TwoArms(EnvBase):
+    """Sees the step, and the last actions of two arms, of one and two dimensions."""
+
+    def __init__(self):
+        super().__init__(batch_size=[])
+        self.observation_spec = Composite(observation=Unbounded((4,)))
+        self.action_spec = Composite(left=Composite(action=Bounded(-9, 9, (1,))), right=Bounded(-9, 9, (2,)))
+        self.reward_spec = Unbounded((1,))
+        self.done_spec = Categorical(2, dtype=torch.bool, shape=(1,))
+        self.played = []
+
+    def _observation(self):
+        last = torch.cat(self.played[-1]) if self.played else torch.zeros(3)
+        return torch.cat([torch.tensor([float(len(self.played))]), last])
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.played = []
+        return TensorDict({"observation": self._observation(), "done": torch.zeros(1, dtype=torch.bool)}, [])
+
+    def _step(self, tensordict):
+        self.played.append((tensordict["left", "action"], tensordict["right"]))
+        done = torch.tensor([len(self.played) == LENGTH])
+        out = {"observation": self._observation(), "reward": torch.ones(1), "done": done}
+        return TensorDict({**out, "terminated": done}, [])
+
+    def _set_seed(self, seed):
+        pass
+
+
+def actor(prior, action_dim, name):
+    network = VelocityMLP(action_dim, 4, prior.prediction_length, 1, hidden_dim=8)
+    own = {f"{part}_key": (name, part) for part in ("history", "source", "chunk")}
+    return WarmPriorActor(network, prior, nfe=1, **own)
+
+
+def test_two_policies_act_side_by_side():
+    torch.manual_seed(0)
+    left, right = actor(PastPrior(H), 1, "left"), actor(GaussianPrior(H), 2, "other")
+    base = TwoArms()
+    chunks = ChunkStep(
+        H,
+        action_keys=[("left", "action"), "right"],
+        chunk_keys=[("left", "chunk"), ("other", "chunk")],
+    )
+    histories = (
+        ActionHistory(H, chunk_key=(name, "chunk"), history_key=(name, "history"))
+        for name in ("left", "other")
+    )
+    env = TransformedEnv(base, Compose(ObservationStack(1), chunks, *histories))
+    check_env_specs(env)
+    rollout = env.rollout(10, TensorDictSequential(left, right))
+    assert rollout["next", "executed_steps"].flatten().tolist() == [3, 3, 1]
+    assert rollout["next", "reward"].sum() == LENGTH
+    for key, played in {"left": [a for a, _ in base.played], "other": [b for _, b in base.played]}.items():
+        whole = rollout[key, "chunk"].flatten(0, 1)[:LENGTH]
+        assert torch.equal(whole, torch.stack(played))
+        assert torch.equal(rollout[key, "history", "actions"][1:], rollout[key, "chunk"][:-1])
+    assert torch.equal(rollout["left", "source", "loc"][1:], rollout["left", "chunk"][:-1])
+    assert not rollout["other", "source", "warm"].any()
+
+
+@pytest.mark.parametrize("keys", [["right"], [("left", "action"), "right", "third"]])
+def test_an_action_that_nobody_chooses_is_refused(keys):
+    with pytest.raises(KeyError, match=r"left.*action.*right.*action_keys"):
+        TransformedEnv(TwoArms(), ChunkStep(H, action_keys=keys, chunk_keys=keys)).rollout(1)
+    with pytest.raises(ValueError, match="chunk_key per action_key"):
+        ChunkStep(H, action_keys=keys, chunk_keys=[])
+
+
+class Team(EnvBase):
+    """A group of three agents, whose actions are counted together."""
+
+    def __init__(self, batch_size=()):
+        super().__init__(batch_size=batch_size)
+        b = self.batch_size
+        agents = Composite(observation=Unbounded((*b, 3, 4)), shape=(*b, 3))
+        self.observation_spec = Composite(agents=agents, shape=b)
+        action = Composite(action=Bounded(-9, 9, (*b, 3, 2)), shape=(*b, 3))
+        self.action_spec = Composite(agents=action, shape=b)
+        self.reward_spec = Unbounded((*b, 1))
+        self.done_spec = Categorical(2, dtype=torch.bool, shape=(*b, 1))
+
+    def _state(self):
+        agents = TensorDict({"observation": self.seen}, (*self.batch_size, 3))
+        return TensorDict({"agents": agents, "done": self.count >= LENGTH}, self.batch_size)
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.count = torch.zeros(*self.batch_size, 1)
+        self.seen = torch.zeros(*self.batch_size, 3, 4)
+        return self._state()
+
+    def _step(self, tensordict):
+        self.count = self.count + 1
+        self.seen = tensordict["agents", "action"].repeat_interleave(2, -1)
+        out = self._state().set("reward", tensordict["agents", "action"].sum((-1, -2)).unsqueeze(-1))
+        return out.set("terminated", out["done"])
+
+    def _set_seed(self, seed):
+        pass
+
+
+def test_the_agents_of_a_group_share_a_policy_and_have_histories_of_their_own():
+    torch.manual_seed(0)
+    prior = PreviewPrior(H)
+    network = VelocityMLP(2, 4, prior.prediction_length, 1, hidden_dim=8)
+    own = {f"{part}_key": ("agents", part) for part in ("observation", "history", "source", "chunk")}
+    policy = WarmPriorActor(network, prior, nfe=1, **own)
+    transforms = policy_transforms(policy, action_key=("agents", "action"))
+    env = TransformedEnv(SerialEnv(2, Team), transforms)
+    rollout = env.rollout(10, policy)
+    assert rollout["agents", "chunk"].shape == (2, 3, 3, 2 * H, 2)
+    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
+    assert rollout["agents", "history"].batch_size == (2, 3, 3)
+    chunk, loc = rollout["agents", "chunk"], rollout["agents", "source", "loc"]
+    assert torch.equal(loc[:, 1:, :, :H], chunk[:, :-1, :, H:])
+    assert torch.equal(rollout["agents", "history", "actions"][:, 1:], chunk[:, :-1, :, :H])
+    returns = chunk[..., :H, :].sum((-1, -3)).cumsum(-1)
+    torch.testing.assert_close(rollout["next", "reward"][:, :2, 0], returns[:, :2, -1])
+
+
+def test_one_key_of_an_environment_works_as_before():
+    env = TransformedEnv(CountingEnv(LENGTH), ChunkStep(H, chunk_keys=["chunk"]))
+    assert env.rollout(9)["next", "reward"].flatten().tolist() == [6.0, 15.0, 7.0]

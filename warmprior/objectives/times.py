@@ -1,0 +1,76 @@
+"""How the times of a flow-matching loss are distributed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from warmprior.modules.checks import check_choice
+
+Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
+"""Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
+
+TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
+
+STEEPNESS = 4.0
+"""``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
+
+
+def uniform_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Draw all times alike, as in Algorithm 1."""
+    return torch.rand(shape, generator=generator, dtype=dtype, device=device)
+
+
+def u_shaped_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""Draw times near both ends more often.
+
+    The density is :math:`p(t) \propto e^{at} + e^{a(1-t)}` with :math:`a = 4` (Lee et al., 2024, "Improving
+    the training of rectified flows"). Their text has :math:`e^{-at}` as the second term, which is no U on [0,
+    1]; this is what their code draws from, by the inverse of
+
+    .. math::
+        F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
+    """
+    u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
+    return t.clamp(0.0, 1.0)  # rounding may leave the interval
+
+
+def logit_normal_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""Draw times in the middle more often: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024)."""
+    return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
+
+
+def start_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""Give ``t = 0`` alone: the network regresses :math:`a_1 - a_0`, which one Euler step returns.
+
+    The field is not trained at any other time: build the policy with ``max_nfe=1``.
+    """
+    return torch.zeros(shape, dtype=dtype, device=device)
+
+
+TIMES: dict[str, Times] = {
+    "uniform": uniform_times,
+    "u-shaped": u_shaped_times,
+    "logit-normal": logit_normal_times,
+    "start": start_times,
+}
+"""Distributions of times by name."""
+
+
+def chosen_times(name: str) -> Times:
+    """Return the distribution of a name; a ``ValueError`` lists the names."""
+    check_choice("times", name, TIMES)
+    return TIMES[name]

@@ -1,0 +1,136 @@
+"""One gradient step of behaviour cloning, and all that it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from warmprior.io.distributed import world_size
+from warmprior.io.workers import count_devices
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.objectives.couplings import Coupling
+from warmprior.objectives.flow_matching import FlowMatchingLoss
+from warmprior.objectives.self_distillation import SelfDistillationLoss
+from warmprior.training.checkpoint import (
+    module_tensors,
+    named,
+    restore_module,
+    restore_optimizer,
+    select,
+    snapshot_optimizer,
+)
+from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.options import TrainingConfig
+
+
+class GradientStep:
+    """The losses of a policy, its optimiser, learning-rate schedule and averaged weights (Table 3).
+
+    Args:
+        actor: the policy; its network is trained in place, and its prior where that has weights.
+        config: the recipe.
+        coupling: pairs sources and targets.
+        generator: source of randomness of the losses, on the network's device.
+    """
+
+    def __init__(
+        self,
+        actor: WarmPriorActor,
+        config: TrainingConfig,
+        *,
+        coupling: Coupling | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        #: The network, and the prior where it has weights as well.
+        self.trained = nn.ModuleDict({"network": actor.network})
+        if isinstance(actor.prior, nn.Module):
+            self.trained["prior"] = actor.prior
+        self.ema = ema_of(self.trained, config.ema_rate)
+        shared: dict[str, Any] = {"objective": config.objective, "weighting": config.weighting}
+        shared |= {"coupling": coupling, "generator": generator}
+        self.loss_module = FlowMatchingLoss(actor, times=config.times, **shared)
+        losses = {self.loss_module: 1.0}
+        if config.self_distillation:
+            teacher = cast(Any, self.ema.module)["network"]
+            losses[SelfDistillationLoss(actor, teacher=teacher, **shared)] = config.self_distillation
+        self._loss: nn.Module = _WeightedSum(losses)
+        if world_size() > 1:
+            self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
+        self._device = generator.device if generator is not None else torch.device("cpu")
+        # Without the cache: what the teacher casts without gradients must not be taken for the weights.
+        self._precision = partial(
+            torch.autocast,
+            self._device.type,
+            torch.bfloat16,
+            enabled=config.precision == "bf16",
+            cache_enabled=False,
+        )
+        self.optimizer = make_optimizer(
+            actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
+        )
+        # A prior that learnt before is fixed by then.
+        prior = actor.prior.parameters() if isinstance(actor.prior, nn.Module) else ()
+        if learning := [parameter for parameter in prior if parameter.requires_grad]:
+            self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
+        self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
+        self._graphs = False
+
+    def compile(self) -> None:
+        """Compile the network; on a GPU, as CUDA graphs."""
+        count_devices()
+        self._graphs = self._device.type == "cuda"
+        self.loss_module.actor_network.network.compile(mode="reduce-overhead" if self._graphs else None)
+
+    def __call__(self, batch: TensorDictBase) -> Tensor:
+        """Take a step on a batch of windows; return its loss, a detached scalar."""
+        if self._graphs:  # what the graphs of the last step have left may be overwritten
+            torch.compiler.cudagraph_mark_step_begin()
+        with self._precision():
+            loss = self._loss(batch)
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.schedule.step()
+        self.ema.update_parameters(self.trained)
+        return loss.detach()
+
+    def averaged(self, actor: WarmPriorActor) -> WarmPriorActor:
+        """Return the policy with the averaged weights."""
+        return actor.replace(**dict(cast(nn.ModuleDict, self.ema.module).items()))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return all that a step changes, by name."""
+        return {
+            **named("trained", module_tensors(self.trained)),
+            **named("ema", module_tensors(self.ema)),
+            **named("optimizer", snapshot_optimizer(self.optimizer)),
+        }
+
+    def load(self, tensors: Mapping[str, Tensor], iteration: int) -> None:
+        """Go on from what :meth:`state` gave after an iteration."""
+        restore_module(self.trained, select("trained", tensors))
+        restore_module(self.ema, select("ema", tensors))
+        restore_optimizer(self.optimizer, select("optimizer", tensors))
+        schedule = self.schedule
+        schedule.last_epoch = iteration
+        rates = zip(self.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True)
+        for group, base, factor in rates:
+            group["lr"] = base * factor(iteration)
+
+
+class _WeightedSum(nn.Module):
+    """The weighted sum of the losses of a batch, whose gradients DDP averages."""
+
+    def __init__(self, losses: dict[FlowMatchingLoss, float]) -> None:
+        super().__init__()
+        self.losses, self.weights = nn.ModuleList(losses), list(losses.values())
+
+    def forward(self, batch: TensorDictBase) -> Tensor:
+        values = [loss(batch)[str(cast(FlowMatchingLoss, loss).out_keys[0])] for loss in self.losses]
+        return torch.stack([w * v for w, v in zip(self.weights, values, strict=True)]).sum()

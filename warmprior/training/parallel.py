@@ -1,0 +1,128 @@
+"""Environments in worker processes, and what happens if one of them dies."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from warmprior.io.workers import end_with_parent, start_method, worker_died
+
+
+def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
+    end_with_parent()
+    return TransformedEnv(make_env(), make_transforms())
+
+
+class _StridedEnv(ParallelEnv):
+    """Its workers number their own episodes, see :func:`parallel_env`."""
+
+    strided_seeds = True
+
+
+def parallel_env(
+    make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
+) -> ParallelEnv:
+    """Environments in worker processes, with the policy's transforms inside the workers.
+
+    Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of
+    ``n`` plays the episodes ``i, i + n, i + 2n, ...`` after ``set_seed(seed, static_seed=True)``.
+
+    Args:
+        make_env: called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker, see
+            :class:`~warmprior.envs.RobosuiteEnv`.
+        make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
+        num_envs: number of workers, at least 1.
+
+    Examples:
+        >>> from functools import partial
+        >>> from warmprior import PastPrior, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
+        >>> from warmprior.training import parallel_env
+        >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
+        ...     return NavigationEnv()
+        >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)
+        >>> env = parallel_env(make_env, make_transforms, num_envs=2)
+        >>> env.batch_size, env.is_closed  # the workers start with the first reset
+        (torch.Size([2]), True)
+    """
+    if num_envs < 1:
+        raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
+    workers = [
+        partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
+        for i in range(num_envs)
+    ]
+    # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
+    # take a core from the workers.
+    return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+
+
+def base_of(env: EnvBase) -> EnvBase:
+    """Return the environment below all transforms."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+@contextmanager
+def watched(env: EnvBase) -> Iterator[None]:
+    """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
+    base = base_of(env)
+    if isinstance(base, ParallelEnv) and base.is_closed:
+        base.start()
+    workers = list(base._workers) if isinstance(base, ParallelEnv) else []
+    finished = threading.Event()
+    dead = ""
+    # When it finds a dead worker, TorchRL ends and closes the others, which then answer nothing.
+    closed_by_torchrl = suppress(ValueError)
+
+    def look() -> None:
+        nonlocal dead
+        ended = []
+        for i, worker in enumerate(workers):
+            with closed_by_torchrl:
+                if not worker.is_alive():
+                    ended.append((worker.exitcode == -signal.SIGTERM, i, worker.exitcode))
+        if ended and not dead:  # TorchRL terminates the others: one that ended in another way was the first
+            _, i, code = min(ended)
+            dead = f"worker {i} of {len(workers)} (exit code {code})"
+
+    def watch() -> None:
+        while not finished.wait(0.5):
+            look()
+            if dead:
+                for worker in workers:
+                    with closed_by_torchrl:
+                        worker.terminate()  # closes the pipes that the parent waits on
+                return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(error, (ConnectionError, EOFError)):
+            for worker in workers:  # TorchRL may notice before the process is reaped
+                with closed_by_torchrl:
+                    worker.join(0.2)
+        look()
+        finished.set()
+        # Without this, idle workers would keep the interpreter from exiting.
+        try:
+            env.close(raise_if_closed=False)
+        except Exception:  # closing complains about dead workers itself
+            for worker in workers:
+                with closed_by_torchrl:
+                    worker.terminate()
+        if dead:
+            advice = "run one environment in this process to see its own error"
+            raise worker_died(dead, advice) from error
+        raise
+    finally:
+        finished.set()
+        watcher.join()
