@@ -30,6 +30,7 @@ from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_keys
 
 __all__ = [
     "ENTRIES",
@@ -158,17 +159,11 @@ def _history(batch_size: Any, *values: Tensor) -> TensorDict:
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
     """Refuse a history that is missing or incomplete (``KeyError``), or of other lengths (``ValueError``)."""
-    found = () if history is None else history.keys()
-    missing = [f'("history", "{name}")' for name in ENTRIES if name not in found]
-    if missing:
-        raise KeyError(
-            f"{whose} needs the history; missing: {', '.join(missing)}. ActionHistory writes it in an "
-            "environment, ActionWindow in a replay buffer"
-        )
+    writers = ". ActionHistory writes it in an environment, ActionWindow in a replay buffer"
+    check_keys(TensorDict() if history is None else history, ENTRIES, f"the history of {whose}", writers)
     lengths = history.get("actions").shape[-2], history.get("forecast").shape[-2]
     if lengths != (history_length, prediction_length):
         raise ValueError(
             f"{whose} needs {history_length} remembered actions and forecasts of {prediction_length}, but "
-            f'("history", "actions") has {lengths[0]} and ("history", "forecast") has {lengths[1]}: make '
-            "windows and environment for the same lengths"
+            f"the history has {lengths[0]} and {lengths[1]}: make windows and environment for equal lengths"
         )

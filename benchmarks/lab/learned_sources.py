@@ -14,8 +14,8 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.modules import MLP
 
 from warmprior import keys
+from warmprior.checks import check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules.actor import StartPoint
-from warmprior.modules.checks import check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules.prior import GaussianPrior, PastPrior, Source
 from warmprior.training.optim import warmup_cosine
 from warmprior.transforms.window import window_replay_buffer, without_images

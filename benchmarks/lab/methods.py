@@ -25,12 +25,13 @@ from typing import Any
 
 import torch
 
+from lab.bridge import BridgeCoupling
 from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorActor
 from warmprior.io.files import digest_of
 from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
-from warmprior.objectives import BridgeCoupling, Coupling, OTCoupling, ReflowCoupling
+from warmprior.objectives import Coupling, OTCoupling, ReflowCoupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
 

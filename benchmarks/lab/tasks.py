@@ -16,6 +16,7 @@ from lab.downloads import OFFICIAL, download_robomimic
 from lab.render import render_demonstrations
 from lab.scripted.generate import generate_demonstrations
 from lab.scripted.tasks import EXPERTS
+from warmprior.checks import check_whole_numbers
 from warmprior.data.images import renderer_versions
 from warmprior.data.lerobot_index import is_remote
 from warmprior.data.opening import LEROBOT, lerobot_name
@@ -26,7 +27,6 @@ from warmprior.envs.tasks import TASKS, get_task
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
-from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.encoder import imagenet_weights
 from warmprior.training import NetworkOptions, Task
 from warmprior.training.files import image_names, opened, read_steps, task_name

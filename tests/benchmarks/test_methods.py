@@ -7,10 +7,11 @@ import pickle
 import pytest
 import torch
 
+from lab.bridge import BridgeCoupling
 from lab.methods import METHODS, Method
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
-from warmprior.objectives import BridgeCoupling, OTCoupling, ReflowCoupling
+from warmprior.objectives import OTCoupling, ReflowCoupling
 from warmprior.training import TrainingConfig
 
 H = 3

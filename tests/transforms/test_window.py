@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from warmprior import ActionWindow, PastPrior, PreviewPrior, WithheldHistory, window_replay_buffer
-from warmprior.modules.checks import check_finite_steps
+from warmprior.checks import check_finite_steps
 
 
 def steps(lengths, numbers=None):

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from warmprior.checks import check_choice
 from warmprior.data.hdf5 import read_index, read_masks, read_origin
 from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.replay import DatasetError, DatasetIndex
@@ -22,7 +23,6 @@ from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE
-from warmprior.modules.checks import check_choice
 
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones

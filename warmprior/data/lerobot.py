@@ -13,11 +13,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from warmprior.checks import check_shape
 from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_file, read_lerobot_index
 from warmprior.data.replay import DatasetError, DemonstrationReader, DemonstrationReplay, store_finite
 from warmprior.io.extras import require
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
-from warmprior.modules.checks import check_shape
 
 DECODED = 2**26  # bytes of frames unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own

@@ -18,12 +18,12 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from tqdm import tqdm
 
+from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
-from warmprior.modules.checks import check_choice, check_whole_numbers
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature

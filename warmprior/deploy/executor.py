@@ -17,9 +17,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_between, check_finite, check_shape, check_whole_numbers
 from warmprior.history import advance, cold_history
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_between, check_finite, check_shape, check_whole_numbers
 from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.diagnostics.flow import (
     SPLIT,
     RunningVariance,
@@ -19,7 +20,6 @@ from warmprior.diagnostics.flow import (
     flat_windows,
 )
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_keys, check_whole_numbers
 from warmprior.modules.interpolant import LinearInterpolant
 from warmprior.modules.network import velocity_field
 from warmprior.modules.ode import integrate

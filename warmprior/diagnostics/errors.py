@@ -11,9 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_keys
 from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, judged, predict
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_keys
 from warmprior.modules.prior import Source
 
 

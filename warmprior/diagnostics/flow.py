@@ -12,9 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.history import advance
-from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import (
+from warmprior.checks import (
     check_between,
     check_finite,
     check_finite_steps,
@@ -22,6 +20,8 @@ from warmprior.modules.checks import (
     check_positions,
     check_whole_numbers,
 )
+from warmprior.history import advance
+from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_positive, check_shape, check_whole_numbers
 from warmprior.diagnostics.flow import (
     RunningVariance,
     allowed_nfes,
@@ -24,7 +25,6 @@ from warmprior.diagnostics.flow import (
     seen_anew,
 )
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positive, check_shape, check_whole_numbers
 
 LEAK_BOUND = 1.0
 """Largest leak of a sampler that spreads like the data; a larger one adds noise."""

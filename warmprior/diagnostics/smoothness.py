@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite_steps, check_keys
+from warmprior.checks import check_finite_steps, check_keys
 from warmprior.transforms.delay import executed_chunk
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from warmprior.checks import check_between, check_whole_numbers
 from warmprior.io.extras import require
-from warmprior.modules.checks import check_between, check_whole_numbers
 
 
 def success_posterior(successes: int, episodes: int) -> Any:

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from warmprior.checks import check_choice, check_shape
 from warmprior.envs.simulator import isolated_numpy_seed
 from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
-from warmprior.modules.checks import check_choice, check_shape
 
 
 class Arm:

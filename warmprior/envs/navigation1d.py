@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from warmprior import keys
-from warmprior.modules.checks import check_between, check_finite_steps, check_shape, check_whole_numbers
+from warmprior.checks import check_between, check_finite_steps, check_shape, check_whole_numbers
 
 STEPS = 64
 OBSTACLES = (-0.45, 0.45)

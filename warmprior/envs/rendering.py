@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from warmprior.checks import check_choice
 from warmprior.io.extras import require
 from warmprior.io.workers import stop_forking
-from warmprior.modules.checks import check_choice
 
 # EGL first: it uses a GPU where there is one. Both render the same pixels in software.
 _BACKENDS = ("egl", "osmesa")

@@ -13,13 +13,13 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from warmprior import keys
+from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
-from warmprior.modules.checks import check_choice, check_whole_numbers
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from warmprior.modules.checks import check_choice
+from warmprior.checks import check_choice
 
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.

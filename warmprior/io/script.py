@@ -62,13 +62,13 @@ def run_script(
             script()
     except BaseException as error:
         if interrupted:  # whatever the libraries in between have made of it
-            print(f"\n{name}: interrupted{hint and '; '}{hint}", file=sys.stderr)
+            sys.stderr.write(f"\n{name}: interrupted{hint and '; '}{hint}\n")
             return 130
         if not isinstance(error, errors):
             raise
         message = error.args[0] if isinstance(error, KeyError) and error.args else error
         teller = f"{name} (process {os.environ['RANK']})" if launched() else name
-        print(f"{teller}: error: {message}", file=sys.stderr, flush=True)
+        sys.stderr.write(f"{teller}: error: {message}\n")
         return 2
     finally:
         signal.signal(signal.SIGINT, before)

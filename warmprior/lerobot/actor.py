@@ -12,9 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.checks import check_shape
 from warmprior.history import history_keys
 from warmprior.lerobot.source import ChunkSource
-from warmprior.modules.checks import check_shape
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior, noise_factor

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from warmprior.checks import check_between, check_shape, check_whole_numbers
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
-from warmprior.modules.checks import check_between, check_shape, check_whole_numbers
 from warmprior.modules.ode import Velocity
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from warmprior.checks import check_between, check_shape
 from warmprior.history import advance, cold_history, without
-from warmprior.modules.checks import check_between, check_shape
 from warmprior.modules.prior import Prior
 
 

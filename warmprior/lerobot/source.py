@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from warmprior.checks import check_positive, check_shape
 from warmprior.history import check_history, cold_history, window_history, without
 from warmprior.lerobot.ports import port_for
-from warmprior.modules.checks import check_positive, check_shape
 from warmprior.modules.prior import Prior, Source
 
 

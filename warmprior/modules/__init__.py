@@ -2,7 +2,7 @@
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
-from warmprior.modules.interpolant import BridgeInterpolant, Interpolant, LinearInterpolant
+from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import (
     AdaLNTransformer,
     ChiTransformer,
@@ -18,7 +18,6 @@ from warmprior.modules.real_time_chunking import RealTimeChunking
 
 __all__ = [
     "AdaLNTransformer",
-    "BridgeInterpolant",
     "ChiTransformer",
     "GaussianPrior",
     "ImageEncoder",

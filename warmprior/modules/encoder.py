@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from torchrl.modules import ConvNet
 
 from warmprior import keys
-from warmprior.io.extras import require
-from warmprior.modules.checks import (
+from warmprior.checks import (
     check_between,
     check_choice,
     check_keys,
     check_shape,
     check_whole_numbers,
 )
+from warmprior.io.extras import require
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config
 

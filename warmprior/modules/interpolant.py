@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from warmprior.modules.checks import check_finite_numbers
 from warmprior.modules.registry import Registered
 
 
@@ -65,51 +64,3 @@ class LinearInterpolant(Interpolant):
         """Coefficients of the straight line."""
         one = torch.ones_like(t)
         return 1 - t, t, -one, one
-
-
-class BridgeInterpolant(Interpolant):
-    r"""Brownian bridge: the straight line with noise between its ends (Tong et al., 2024, Sec. 3.4).
-
-    .. math::
-        a_t = (1 - t) a_0 + t a_1 + \sigma \sqrt{t (1 - t)} \, \varepsilon, \qquad
-        u_t = a_1 - a_0 + \sigma \frac{1 - 2t}{2 \sqrt{t (1 - t)}} \, \varepsilon .
-
-    On pairs of :class:`~warmprior.objectives.BridgeCoupling` the mean of :math:`u_t` given :math:`a_t` is the
-    probability flow of the Schroedinger bridge. The velocity grows without bound towards the ends: times are
-    kept 0.001 away from them.
-
-    Args:
-        sigma: of the noise, > 0, in normalised action units.
-
-    Raises:
-        ValueError: if ``sigma`` is not a finite number > 0.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior import BridgeInterpolant
-        >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
-        >>> a_t, velocity = BridgeInterpolant(0.2)(a0, a1, t, torch.Generator().manual_seed(0))
-        >>> bool(a_t != 0.5), velocity.item()
-        (True, 1.0)
-    """
-
-    name = "bridge"
-
-    def __init__(self, sigma: float = 0.5) -> None:
-        check_finite_numbers(sigma=sigma)
-        if sigma <= 0:
-            raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
-        self.sigma = float(sigma)
-
-    coefficients = LinearInterpolant.coefficients
-
-    def __call__(
-        self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Point on the path and its velocity, with noise of ``generator``."""
-        point, velocity = super().__call__(a0, a1, t)
-        t = t[..., None, None].clamp(1e-3, 1 - 1e-3)
-        width = (t * (1 - t)).sqrt()
-        noise = torch.randn(point.shape, generator=generator, dtype=point.dtype, device=point.device)
-        noise = self.sigma * noise
-        return point + width * noise, velocity + (1 - 2 * t) / (2 * width) * noise

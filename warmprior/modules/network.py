@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers
 from warmprior.modules.registry import Registered
 
 

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite_numbers, check_keys
+from warmprior.checks import check_finite_numbers, check_keys
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 

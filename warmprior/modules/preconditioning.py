@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.modules.checks import check_positions
+from warmprior.checks import check_positions
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer

@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from warmprior.checks import check_between, check_finite_numbers, check_shape, check_whole_numbers
 from warmprior.history import check_history
-from warmprior.modules.checks import check_between, check_finite_numbers, check_whole_numbers
 from warmprior.modules.registry import Registered
 
 
@@ -162,21 +162,13 @@ class Prior(Registered):
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
     """The checked result of :meth:`Prior.mean`, in the history's dtype."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
-    found = prior.mean(history)
-    loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
-    forecast = history.get("forecast")  # of the same shape
-    if not (
-        isinstance(loc, Tensor)
-        and isinstance(warm, Tensor)
-        and loc.shape == forecast.shape
-        and warm.shape == (*forecast.shape[:-1], 1)
-        and warm.dtype == torch.bool
-    ):
-        got = [f"{tuple(v.shape)} of {v.dtype}" for v in (loc, warm) if isinstance(v, Tensor)]
-        raise ValueError(
-            f"{type(prior).__name__}.mean must return two tensors, loc {tuple(forecast.shape)} and warm "
-            f"{(*forecast.shape[:-1], 1)} of type bool, got {type(found).__name__} {' and '.join(got)}"
-        )
+    mean, forecast = prior.mean(history), history.get("forecast")
+    name = f"{type(prior).__name__}.mean"
+    loc, warm = mean if isinstance(mean, tuple) and len(mean) == 2 else (mean, None)
+    if getattr(warm, "dtype", None) != torch.bool:
+        raise ValueError(f"{name} must return two tensors, loc and a bool warm, got {type(mean).__name__}")
+    check_shape(f"loc of {name}", loc, forecast.shape)
+    check_shape(f"warm of {name}", warm, (*forecast.shape[:-1], 1))
     return loc.to(forecast.dtype), warm
 
 

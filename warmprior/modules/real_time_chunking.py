@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.checks import check_finite_numbers, check_whole_numbers
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 

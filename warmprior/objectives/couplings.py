@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import chain
 from typing import Any, ClassVar
@@ -11,17 +10,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from warmprior.checks import check_finite_numbers, check_whole_numbers
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.modules.interpolant import BridgeInterpolant
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
 
 The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. A coupling may
-have ``config()``, what it depends on, so that a training knows whether it may be continued.
+have ``config()``, what it depends on, so that a training knows whether it may be continued, and an
+``interpolant``, a path of its own, which the loss takes.
 """
 
 
@@ -94,58 +93,6 @@ class OTCoupling:
         from scipy.optimize import linear_sum_assignment
 
         return torch.as_tensor(linear_sum_assignment(cost.numpy())[1])
-
-
-class BridgeCoupling(OTCoupling):
-    r"""SB-CFM: source and data are paired as in the Schroedinger bridge of Brownian motion.
-
-    Every target draws its source from the entropic plan of the batch,
-
-    .. math::
-        \pi_{ij} \propto u_i v_j \exp\left(- c_{ij} / 2 \sigma^2\right), \qquad
-        c_{ij} = \|a_0^i - a_1^j\|^2 + w \|o^i - o^j\|^2,
-
-    with uniform marginals (Tong et al., 2024, Prop. 3.4), and the path between them is a Brownian bridge,
-    :class:`~warmprior.BridgeInterpolant`, which the loss takes from here. At small ``sigma`` this is
-    :class:`OTCoupling`, at a large one pairs are as they come.
-
-    Args:
-        sigma: of the Brownian motion at ``t = 1``, > 0, in normalised action units.
-        observation_weight: ``w``, see :class:`OTCoupling`.
-
-    Raises:
-        ValueError: as :class:`OTCoupling`, or if ``sigma`` is not a finite number > 0.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.objectives import BridgeCoupling
-        >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
-        >>> [x.flatten().tolist() for x in BridgeCoupling(sigma=0.1, observation_weight=0.0)(a0, a1)]
-        [[1.0, 0.0], [5.0, 4.0]]
-    """
-
-    ROUNDS: ClassVar[int] = 5  # of Sinkhorn's iteration at each noise, five times as many at the last
-
-    def __init__(self, sigma: float = 0.5, observation_weight: float = 10.0) -> None:
-        super().__init__(observation_weight)
-        self.interpolant = BridgeInterpolant(sigma)
-
-    def config(self) -> dict[str, Any]:
-        """What it depends on."""
-        return {**super().config(), "name": "bridge", "sigma": self.interpolant.sigma}
-
-    def assigned(self, cost: Tensor) -> Tensor:
-        """Drawn from the plan by PyTorch's global generator, which a training seeds."""
-        # From a large noise down by halves: at a small one alone the iteration hardly moves.
-        noise = 2 * self.interpolant.sigma**2
-        halvings = math.ceil(math.log2(max(1.0, float(cost.max()) / noise)))
-        row = cost.new_zeros(len(cost), 1)
-        for k in range(halvings, -1, -1):
-            now = noise * 2**k
-            for _ in range(self.ROUNDS if k else 5 * self.ROUNDS):
-                column = -now * ((row - cost) / now).logsumexp(0, keepdim=True)
-                row = -now * ((column - cost) / now).logsumexp(1, keepdim=True)
-        return torch.multinomial(((column - cost) / noise).softmax(1), 1).squeeze(1)
 
 
 def _squared_distances(x: Tensor, y: Tensor) -> Tensor:

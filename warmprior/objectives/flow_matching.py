@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from warmprior import keys
+from warmprior.checks import check_choice, check_keys, check_positions
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_choice, check_keys, check_positions
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.objectives.couplings import Coupling

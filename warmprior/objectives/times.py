@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from warmprior.modules.checks import check_choice
+from warmprior.checks import check_choice
 
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""

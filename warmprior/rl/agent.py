@@ -15,8 +15,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
+from warmprior.checks import check_finite, check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_finite, check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss

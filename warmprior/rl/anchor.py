@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from warmprior import keys
+from warmprior.checks import check_choice
 from warmprior.history import check_history, window_history
-from warmprior.modules.checks import check_choice
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 

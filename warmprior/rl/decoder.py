@@ -15,8 +15,8 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 from warmprior import keys
+from warmprior.checks import check_choice, check_keys, check_positive, check_shape
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_choice, check_keys, check_positive, check_shape
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 

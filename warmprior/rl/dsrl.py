@@ -19,7 +19,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
-from warmprior.modules.checks import (
+from warmprior.checks import (
     check_choice,
     check_finite,
     check_finite_numbers,

@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.modules.checks import check_positive, check_whole_numbers
+from warmprior.checks import check_positive, check_whole_numbers
 
 
 class BoxTanhNormal(TanhNormal):

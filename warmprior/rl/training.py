@@ -19,9 +19,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from warmprior import keys
+from warmprior.checks import check_finite
 from warmprior.io.files import read_tensors, save_file, write_atomic
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_finite
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state

@@ -12,7 +12,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers
 from warmprior.modules.network import VelocityNetwork, uncompiled
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+from warmprior.checks import check_choice, check_finite_numbers, check_whole_numbers
 from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
@@ -15,7 +16,6 @@ from warmprior.modules import (
     VelocityNetwork,
     VisionNetwork,
 )
-from warmprior.modules.checks import check_choice, check_finite_numbers, check_whole_numbers
 from warmprior.modules.encoder import load_imagenet
 from warmprior.objectives.flow_matching import Objective, Weighting
 from warmprior.objectives.times import TimesName

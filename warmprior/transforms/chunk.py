@@ -20,7 +20,7 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside

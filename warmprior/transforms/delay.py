@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from warmprior import keys
-from warmprior.modules.checks import check_keys, check_whole_numbers
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 

@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.checks import check_between, check_finite_numbers, check_keys, check_whole_numbers
 from warmprior.history import advance, cold_history, history_keys, without
-from warmprior.modules.checks import check_between, check_finite_numbers, check_keys, check_whole_numbers
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 

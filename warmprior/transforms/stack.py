@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from warmprior import keys
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers
 from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
 

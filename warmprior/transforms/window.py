@@ -11,8 +11,8 @@ from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
+from warmprior.checks import check_finite_steps, check_whole_numbers
 from warmprior.history import window_history
-from warmprior.modules.checks import check_finite_steps, check_whole_numbers
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
