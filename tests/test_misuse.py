@@ -74,7 +74,7 @@ def test_a_training_is_of_its_units(tmp_path):
         ({"action": 1}, PRIOR, TypeError, "takes a TensorDict of steps or a Task, got dict"),
         (TensorDict(dict(steps().items()), []), PRIOR, ValueError, "must be flat steps"),
         (steps(), PastPrior, TypeError, "an object such as PastPrior"),
-        (steps().exclude("episode"), PRIOR, KeyError, "lack .'episode'"),
+        (steps().exclude("episode"), PRIOR, KeyError, r"missing: .'episode'"),
     ],
 )
 def test_what_train_policy_cannot_take(data, prior, error, said):

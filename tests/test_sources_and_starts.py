@@ -87,7 +87,7 @@ def test_a_mean_that_is_no_pair_is_named():
 
 
 def test_a_start_point_is_fixed_and_belongs_to_the_training(tmp_path, data):
-    with pytest.raises(ValueError, match=r"Halfway is not trained with the flow.*freeze it"):
+    with pytest.raises(ValueError, match=r"Halfway before the flow, and freeze it"):
         cloning(tmp_path / "free", data, start=Halfway())
     training = cloning(tmp_path / "one", data, start=frozen())
     training.step()

@@ -8,7 +8,6 @@ from numbers import Integral
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -57,9 +56,9 @@ def check_shape(name: str, value: Any, expected: Sequence[int]) -> None:
         raise ValueError(f"{name} has shape {list(value.shape)}, expected {list(expected)}")
 
 
-def check_keys(tensordict: TensorDictBase, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
-    """A ``KeyError`` names the needed keys that are missing, and hints at who writes them."""
-    missing = [key for key in needed if tensordict.get(key, None) is None]
+def check_keys(place: Any, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
+    """Raise KeyError for needed keys that a tensordict or spec lacks, and hint at who writes them."""
+    missing = [key for key in needed if place.get(key, None) is None]
     if missing:
         raise KeyError(f"{whose} needs the keys {list(needed)}; missing: {missing}{hint}")
 

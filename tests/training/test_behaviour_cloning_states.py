@@ -61,7 +61,7 @@ def _actor(network):
 @pytest.mark.parametrize(
     ("network", "error", "said"),
     [
-        (Plain, TypeError, "cannot save Plain: only VelocityNetwork"),
+        (Plain, TypeError, "cannot save Plain: only subclasses of VelocityNetwork"),
         (grown, ValueError, "VelocityMLP could not be loaded again"),
     ],
 )

@@ -160,7 +160,7 @@ def test_missing_files(tmp_path):
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 7"):
+    with pytest.raises(ValueError, match=r"has format .*, and this version reads 7"):
         load_policy(tmp_path)
 
 

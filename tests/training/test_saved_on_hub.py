@@ -87,14 +87,14 @@ def test_a_folder_is_a_folder(hub, actor, tmp_path):
     for name in ("missing", "a/b/c", "../someone", f"{tmp_path}/missing", tmp_path / "missing"):
         with pytest.raises(FileNotFoundError, match="no policy at"):
             load_policy(name)
-    with pytest.raises(ValueError, match=r"is a folder on this machine.*leave out revision='main'"):
+    with pytest.raises(ValueError, match=r"is no repository at the hub: leave out revision='main'"):
         load_policy(NAME, revision="main")
     assert not hub.requests
 
 
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
-    with pytest.raises(ValueError, match=f"{NAME} is there already, and public"):
+    with pytest.raises(ValueError, match=f"{NAME} is public"):
         push_policy(actor, NAME, token=TOKEN, private=True)
     assert not hub.files(NAME) and not hub.objects
 

@@ -55,7 +55,7 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
 @pytest.mark.parametrize(
     ("name", "changed", "error", "said"),
     [
-        ("own", {"episode": None}, KeyError, r"demonstrations of own lack \['episode'\]"),
+        ("own", {"episode": None}, KeyError, r"demonstrations of own.*missing: \['episode'\]"),
         ("own", {"action": torch.zeros(40)}, ValueError, r"'action' of own has shape \(40,\)"),
         ("own", {"observation": torch.full((40, 3), math.nan)}, ValueError, "NaN|finite"),
         ("../own", {}, ValueError, "become names of files: '../own' cannot"),

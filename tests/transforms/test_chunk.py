@@ -114,10 +114,10 @@ def test_wrong_chunk_length(length):
 @pytest.mark.parametrize(
     ("horizon", "options", "said"),
     [
-        (3, {"execute": 4}, "need 1 <= execute <= chunk_length <= prediction_length"),
+        (3, {"execute": 4}, "need execute <= chunk_length <= prediction_length"),
         (3, {"execute": 0}, "execute must be a whole number of at least 1, got 0"),
         (3, {"execute": 2.5}, "execute must be a whole number of at least 1, got 2.5"),
-        (3, {"prediction_length": 2}, "need 1 <= execute <= chunk_length <= prediction_length"),
+        (3, {"prediction_length": 2}, "need execute <= chunk_length <= prediction_length"),
         (0, {}, "chunk_length must be a whole number of at least 1, got 0"),
         (-1, {"execute": 1}, "chunk_length must be a whole number of at least 1, got -1"),
     ],

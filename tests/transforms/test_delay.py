@@ -207,9 +207,9 @@ def test_specs_and_jumps_where_chunks_take_effect():
 
 
 def test_numbers_that_do_not_go_together():
-    with pytest.raises(ValueError, match=r"delay of 4.*3 actions.*0 <= delay <= execute"):
+    with pytest.raises(ValueError, match=r"delay of 4.*at least 4 actions.*got 3"):
         InferenceDelay(4, execute=3)
-    with pytest.raises(ValueError, match="whole number of control steps, at least 0"):
+    with pytest.raises(ValueError, match="delay must be a whole number of at least 0"):
         InferenceDelay(1.5, execute=3)
     with pytest.raises(ValueError, match=r"6 actions do not reach 5.*delay of 2.*at most 4"):
         TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)).reset()
@@ -218,5 +218,5 @@ def test_numbers_that_do_not_go_together():
     # As many as the delay leaves are executed.
     whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
     assert whole.rollout(2, lagging(6))["next", "executed_steps"].flatten().tolist() == [4, 4]
-    with pytest.raises(KeyError, match=r"delay.*hand over"):
+    with pytest.raises(KeyError, match=r"delay.*Hand over"):
         whole.step(lagging(6)(whole.reset()).exclude("rtc"))

@@ -128,7 +128,7 @@ def test_lengths_that_do_not_go_together():
     # An environment made for another prior, and a policy that meets it.
     env = TransformedEnv(CountingEnv(9), policy_transforms(PastPrior(3)))
     actor = WarmPriorActor(VelocityMLP(ACTION_DIM, 4, 6, hidden_dim=8), PreviewPrior(3), nfe=1)
-    said = r'PreviewPrior.*needs 3 .*forecasts of 6.*"forecast"\) has 3: make windows and env'
+    said = r"PreviewPrior.*needs 3 .*forecasts of 6.*has 3 and 3: make windows and env"
     with pytest.raises(ValueError, match=said):
         env.rollout(2, actor)
     with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 3, d_a\].* found \(6, 2\)"):

@@ -132,9 +132,9 @@ def test_a_share_that_is_none_and_a_history_that_is_missing():
     ("options", "message"),
     [
         ({"observation_steps": 0}, "observation_steps must be a whole number of at least 1, got 0"),
-        ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*chunk_length=0"),
-        ({"prediction_length": 1}, "prediction_length=1"),
-        ({"history_length": 1}, "history_length=1"),
+        ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*got 0"),
+        ({"prediction_length": 1}, "got 2, 1 and 2"),
+        ({"history_length": 1}, "got 2, 2 and 1"),
     ],
 )
 def test_lengths_that_cannot_be(options, message):

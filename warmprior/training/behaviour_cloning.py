@@ -107,10 +107,7 @@ class BehaviourCloning:
         check_saveable(actor)  # before hours are spent on what would be lost
         check_batch(config.batch_size)
         if actor.start is not None and any(p.requires_grad for p in actor.start.parameters()):
-            raise ValueError(
-                f"{type(actor.start).__name__} is not trained with the flow: train it before, and freeze it "
-                "with requires_grad_(False)"
-            )
+            raise ValueError(f"train {type(actor.start).__name__} before the flow, and freeze it")
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
@@ -192,10 +189,7 @@ class BehaviourCloning:
             from_leader(lambda: None)  # it has the lock
             self._restore()  # what another process did since this object was built
             if from_leader(lambda: self.iteration) != self.iteration:
-                raise OSError(
-                    f"the processes read different states at {self.state_path}: choose a directory that all "
-                    "machines share"
-                )
+                raise OSError(f"processes read different states at {self.state_path}: share the directory")
             try:
                 self._run(description, progress)
             finally:

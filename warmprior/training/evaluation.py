@@ -317,10 +317,7 @@ def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
                 "with success= or measures="
             )
     if keys.EXECUTED not in known or keys.ACTIONS not in known:
-        raise KeyError(
-            f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: give it the policy's transforms, "
-            "see warmprior.policy_transforms"
-        )
+        raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
 
 
 def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:

@@ -17,18 +17,14 @@ def row_seeding(env: EnvBase) -> Callable[[int, int], None]:
         return lambda row, seed: None
     if not isinstance(base, (SerialEnv, ParallelEnv)):
         raise ValueError(
-            f"{type(base).__name__} plays {env.batch_size[0]} episodes at once, and nothing tells which "
-            "seed a row plays: evaluate a single one, or several in a SerialEnv, a ParallelEnv or "
-            "warmprior.training.parallel_env. If its row i plays the seeds seed + i, seed + i + n, ... "
-            "after set_seed(seed, static_seed=True), let its class say strided_seeds = True"
+            f"nothing tells which seeds the {env.batch_size[0]} rows of {type(base).__name__} play: put "
+            "single environments into a SerialEnv, a ParallelEnv or parallel_env; or, if set_seed(seed, "
+            "static_seed=True) lets row i play seed + i, seed + i + n, ..., set strided_seeds in its class"
         )
 
     for make_env, options in zip(base.create_env_fn, base.create_env_kwargs, strict=True):
         if _has_offset(make_env) or options.get("seed_offset"):
-            raise ValueError(
-                "an environment built with a seed_offset does not play the seed that it is given: leave it "
-                "out, or build all of them by warmprior.training.parallel_env"
-            )
+            raise ValueError("leave out seed_offset, or build the environments by parallel_env")
     rows = [base[row] for row in range(env.batch_size[0])]
     return lambda row, seed: rows[row].set_seed(seed, static_seed=True)
 

@@ -53,10 +53,8 @@ def _check_format(path: Path, config: Any) -> None:
     if not isinstance(config, dict) or "warmprior" not in config:
         raise ValueError(f"{path} is of no policy of warmprior")
     if config.get("format") != FORMAT:
-        raise ValueError(
-            f"{path} has format {config.get('format')}, this version of warmprior reads {FORMAT}: save the "
-            "policy again with a matching version"
-        )
+        found = config.get("format")
+        raise ValueError(f"{path} has format {found}, and this version reads {FORMAT}: save the policy again")
 
 
 def _folder(place: str | Path, *, revision: str | None = None, token: str | None = None) -> Path:
@@ -64,10 +62,7 @@ def _folder(place: str | Path, *, revision: str | None = None, token: str | None
     path = Path(place)
     if path.exists() or not (isinstance(place, str) and is_repository(place)):
         if revision is not None:
-            raise ValueError(
-                f"{place} is a folder on this machine, or no user/name of a repository at the hub: leave out "
-                f"revision={revision!r}"
-            )
+            raise ValueError(f"{place} is no repository at the hub: leave out revision={revision!r}")
         return path
     hub = require("huggingface_hub", "sim")
     fetch = partial(hub.snapshot_download, place, token=token)
@@ -90,10 +85,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     """Everything but the weights as JSON; a ``TypeError`` if a part cannot be written so."""
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):
-        raise TypeError(
-            f"cannot save {type(network).__name__}: only VelocityNetwork subclasses carry the "
-            "configuration that load_policy needs"
-        )
+        raise TypeError(f"cannot save {type(network).__name__}: only subclasses of VelocityNetwork are saved")
     guidance = actor.ode.guidance
     config = {
         "format": FORMAT,
@@ -118,10 +110,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     try:
         return as_json(config)
     except TypeError as error:
-        raise TypeError(
-            f"cannot save {actor.prior}, {type(network).__name__} and the normaliser: {error}. Use plain "
-            "numbers and text for options, and plain names for the normaliser's keys."
-        ) from error
+        raise TypeError(f"cannot save {type(network).__name__} with {actor.prior}: {error}") from error
 
 
 def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
@@ -238,10 +227,7 @@ def push_policy(
             (folder / CARD).write_text(card)
         api.create_repo(repository, private=private, exist_ok=True)
         if private and not api.repo_info(repository).private:
-            raise ValueError(
-                f"{repository} is there already, and public: choose another name, or make it private at the "
-                "hub"
-            )
+            raise ValueError(f"{repository} is public: choose another name, or make it private at the hub")
         if revision is not None:
             api.create_branch(repository, branch=revision, exist_ok=True)
         sent = api.upload_folder(

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from warmprior.checks import check_choice, check_keys
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -87,10 +88,7 @@ class Task:
             if Path(part).name != part:
                 raise ValueError(f"name and style become names of files: {part!r} cannot")
         for key, how in self.measures.items():
-            if how not in ("max", "sum", "last"):
-                raise ValueError(
-                    f"measures of {self.name}: {key!r} is combined by 'max', 'sum' or 'last', not {how!r}"
-                )
+            check_choice(f"the measure {key!r}", how, ("max", "sum", "last"))
 
     @classmethod
     def of(
@@ -115,13 +113,9 @@ class Task:
             ValueError: if an entry has another shape, or is not finite.
         """
         if data.ndim != 1:
-            raise ValueError(
-                f"the demonstrations of {name} must be flat steps, TensorDict(steps, [N]), got the batch "
-                f"size {tuple(data.shape)}"
-            )
-        missing = [key for key in (OBSERVATION, ACTION, EPISODE) if key not in list(data.keys())]
-        if missing:
-            raise KeyError(f"the demonstrations of {name} lack {missing}: they have {list(data.keys())}")
+            raise ValueError(f"the demonstrations of {name} must be flat steps [N], got {tuple(data.shape)}")
+        needed = (OBSERVATION, ACTION, EPISODE)
+        check_keys(data, needed, f"the demonstrations of {name}", f": they have {list(data.keys())}")
         for key in (OBSERVATION, ACTION):
             if data[key].ndim != 2:
                 raise ValueError(f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]")

@@ -231,11 +231,8 @@ class ChunkStep(EnvTransform):
         prediction_length = chunk_length if prediction_length is None else prediction_length
         check_whole_numbers(chunk_length=chunk_length, execute=execute)
         if not execute <= chunk_length <= prediction_length:
-            raise ValueError(
-                "need 1 <= execute <= chunk_length <= prediction_length, got "
-                f"execute={execute}, chunk_length={chunk_length}, "
-                f"prediction_length={prediction_length}"
-            )
+            given = f"{execute}, {chunk_length} and {prediction_length}"
+            raise ValueError(f"need execute <= chunk_length <= prediction_length, got {given}")
         self.chunk_length = chunk_length
         self.execute = execute
         self.prediction_length = prediction_length

@@ -13,9 +13,12 @@ from tensordict.utils import unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 
 from warmprior import keys
+from warmprior.checks import check_keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation
 from warmprior.transforms.inner_step import EnvTransform
+
+_SIM_STATE = ": build the environment with sim_state=True"
 
 
 class CameraImages(EnvTransform):
@@ -68,13 +71,8 @@ class CameraImages(EnvTransform):
         return base
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        state = next_tensordict.get(keys.SIM_STATE, None)
-        if state is None:
-            raise KeyError(
-                f"CameraImages needs the simulator's state at {keys.SIM_STATE!r}: build the environment with "
-                "sim_state=True"
-            )
-        simulator, numbers = self._simulator, state.cpu().numpy()
+        check_keys(next_tensordict, [keys.SIM_STATE], "CameraImages", _SIM_STATE)
+        simulator, numbers = self._simulator, next_tensordict.get(keys.SIM_STATE).cpu().numpy()
         vector = next_tensordict.get(keys.OBSERVATION)
         entries = {keys.STATE: vector}
         for camera in self.cameras:
@@ -84,10 +82,7 @@ class CameraImages(EnvTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Replace the vector by the vector and images."""
-        if keys.SIM_STATE not in observation_spec:
-            raise KeyError(
-                f"CameraImages found no {keys.SIM_STATE!r}: build the environment with sim_state=True"
-            )
+        check_keys(observation_spec, [keys.SIM_STATE], "CameraImages", _SIM_STATE)
         vector, shape = observation_spec[keys.OBSERVATION], (3, self.size, self.size)
         image = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=vector.device)
         images = {f"{camera}_image": image.clone() for camera in self.cameras}
@@ -139,9 +134,8 @@ class EncodeObservation(EnvTransform):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the features."""
-        observation = tensordict.get(self.in_keys[0], None)
-        if observation is None:
-            raise KeyError(f"EncodeObservation found no {self.in_keys[0]!r}")
+        check_keys(tensordict, self.in_keys, "EncodeObservation")
+        observation = tensordict.get(self.in_keys[0])
         batch, device = tensordict.batch_size, next(self.network.parameters()).device
         seen = network_observation(observation, batch)
         features = encoded(self.network, seen.to(device))

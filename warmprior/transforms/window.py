@@ -78,11 +78,8 @@ class ActionWindow(Transform):
         prediction_length = chunk_length if prediction_length is None else prediction_length
         history_length = chunk_length if history_length is None else history_length
         if not 1 <= chunk_length <= min(prediction_length, history_length):
-            raise ValueError(
-                "need 1 <= chunk_length <= prediction_length and history_length, got "
-                f"chunk_length={chunk_length}, prediction_length={prediction_length}, "
-                f"history_length={history_length}"
-            )
+            given = f"{chunk_length}, {prediction_length} and {history_length}"
+            raise ValueError(f"need 1 <= chunk_length <= prediction_length and history_length, got {given}")
         self.chunk_length, self.history_length = chunk_length, history_length
         observations, action, episode = _checked(data, observation_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
@@ -101,19 +98,14 @@ class ActionWindow(Transform):
         """Write the windows of the sampled steps."""
         frame = tensordict.get(keys.FRAME)
         if frame is None:
-            raise KeyError(
-                f"ActionWindow needs the index of each sampled step under {keys.FRAME!r}: store "
-                "torch.arange(N) there, or use window_replay_buffer"
-            )
+            raise KeyError(f"ActionWindow needs steps at {keys.FRAME!r}: see window_replay_buffer")
         batch, before = tensordict.batch_size, self.history_length
         frame = frame.reshape(-1, 1)
         try:
             start, end = _rows(self.start, frame), _rows(self.end, frame)
         except IndexError as error:
-            raise IndexError(
-                f"{keys.FRAME!r} has steps from {int(frame.min())} to {int(frame.max())}, but the data "
-                f"hold 0 to {len(self.start) - 1}"
-            ) from error
+            steps, last = f"{int(frame.min())} to {int(frame.max())}", len(self.start) - 1
+            raise IndexError(f"{keys.FRAME!r} has steps {steps}, but the data hold 0 to {last}") from error
         index = frame + self.action_offsets
         is_pad = index[:, before:] > end
         action = _rows(self.action, index.clamp(start, end))
