@@ -96,7 +96,7 @@ def test_every_dimension_may_have_a_bound_of_its_own():
     ("options", "message"),
     [
         ({"solver": "dopri5"}, "unknown solver 'dopri5'.*euler.*rk4"),
-        ({"nfe": 0}, "positive multiple of 1"),
+        ({"nfe": 0}, "nfe must be a whole number of at least 1"),
         ({"nfe": 3, "solver": "heun"}, "multiple of 2 for the heun solver, got 3"),
         ({"clip": 0.0}, "clip"),
         ({"clip": (1.0, -1.0)}, "clip"),

@@ -85,6 +85,30 @@ def test_what_cannot_be_saved_is_told_before_anything_is_trained(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_another_object_would_be_built_from_is_refused(tmp_path):
+    class Half(PastPrior):
+        name = "half-of-the-tests"
+
+        def __init__(self, chunk_length, sigma=0.5):
+            super().__init__(chunk_length, sigma=0.5 * sigma)
+
+    class Default(PastPrior):
+        name = "default-of-the-tests"
+        horizon = 4  # of the class, and not of the object
+
+        def __init__(self, chunk_length, horizon=8):
+            super().__init__(chunk_length)
+
+    recipe = TrainingConfig(iterations=2)
+    try:
+        for prior, error, fact in ((Half(H), ValueError, "sigma"), (Default(H), TypeError, "horizon")):
+            with pytest.raises(error, match=fact):
+                BehaviourCloning(actor_for(prior), demonstrations(), recipe, tmp_path)
+        assert repr(Default(H)) == "Default(...)"
+    finally:
+        del Prior.classes["half-of-the-tests"], Prior.classes["default-of-the-tests"]
+
+
 def test_a_taken_name_is_refused():
     with pytest.raises(ValueError, match=r"'past' is the name of .*PastPrior.*: choose another"):
 

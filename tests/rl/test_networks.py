@@ -94,7 +94,7 @@ def test_residuals_are_as_large_as_the_source_deviates_from_the_anchor():
 
 def test_sampler_options():
     decoder = make_decoder(PastPrior(P), 0.5)
-    with pytest.raises(ValueError, match="must be 'normal', 'clipped', 'truncated' or 'uniform'"):
+    with pytest.raises(ValueError, match="must be one of normal, clipped, truncated, uniform"):
         ResidualSampler(decoder, distribution="laplace")
     with pytest.raises(ValueError, match="a prior without noise leaves 'uniform'"):
         ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5), distribution="clipped")

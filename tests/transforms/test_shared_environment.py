@@ -15,15 +15,22 @@ from warmprior import (
     ActionHistory,
     ChunkStep,
     GaussianPrior,
+    HistoryObservation,
+    InferenceDelay,
     ObservationStack,
     PastPrior,
     PreviewPrior,
+    PriorAnchor,
+    PriorDecoder,
     VelocityMLP,
     WarmPriorActor,
     policy_transforms,
 )
+from warmprior.deploy import AsyncExecutor
+from warmprior.training import play_episode
 
 H, LENGTH = 3, 7
+CHUNK = ("agents", "chunk")
 
 
 class TwoArms(EnvBase):
@@ -61,6 +68,13 @@ def actor(prior, action_dim, name):
     return WarmPriorActor(network, prior, nfe=1, **own)
 
 
+ARMS = (("left", 0), ("other", 2))
+
+
+def own(name):
+    return {"chunk_key": (name, "chunk"), "history_key": (name, "history")}
+
+
 def test_two_policies_act_side_by_side():
     torch.manual_seed(0)
     left, right = actor(PastPrior(H), 1, "left"), actor(GaussianPrior(H), 2, "other")
@@ -85,6 +99,44 @@ def test_two_policies_act_side_by_side():
         assert torch.equal(rollout[key, "history", "actions"][1:], rollout[key, "chunk"][:-1])
     assert torch.equal(rollout["left", "source", "loc"][1:], rollout["left", "chunk"][:-1])
     assert not rollout["other", "source", "warm"].any()
+
+
+def histories_of(*names):
+    return [ActionHistory(H, chunk_key=(n, "chunk"), history_key=(n, "history")) for n in names]
+
+
+def two_arms(*more):
+    chunks = [("left", "chunk"), ("other", "chunk")]
+    step = ChunkStep(H, action_keys=[("left", "action"), "right"], chunk_keys=chunks)
+    return TransformedEnv(TwoArms(), Compose(ObservationStack(1), step, *more))
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [
+        histories_of("left", "left"),
+        [*histories_of("left", "other"), *(InferenceDelay(d, execute=H, **own(n)) for n, d in ARMS)],
+        [*histories_of("left", "other"), *(PriorAnchor(actor(GaussianPrior(H), 2, n)) for n, _ in ARMS)],
+        [*histories_of("left", "other"), *(HistoryObservation(history_key=(n, "history")) for n, _ in ARMS)],
+    ],
+    ids=["histories", "delays", "anchors", "observations"],
+)
+def test_two_transforms_that_write_one_key_are_refused(transforms):
+    with pytest.raises(ValueError, match=r"would overwrite \["):
+        two_arms(*transforms).rollout(1)
+
+
+def test_what_knows_the_usual_keys_alone_says_so(tmp_path):
+    policy = actor(PastPrior(H), 2, "left")
+    env = TransformedEnv(CountingEnv(LENGTH), policy_transforms(PastPrior(H)))
+    usual = "history_key='history', source_key='prior', chunk_key=\\('vla_action', 'chunk'\\)"
+    for call in (
+        lambda: PriorDecoder(policy, delta=0.5),
+        lambda: AsyncExecutor(policy),
+        lambda: play_episode(policy, env, 0),
+    ):
+        with pytest.raises(ValueError, match=rf"usual keys: give it policy.replace\({usual}\)"):
+            call()
 
 
 @pytest.mark.parametrize("keys", [["right"], [("left", "action"), "right", "third"]])
@@ -135,6 +187,10 @@ def test_the_agents_of_a_group_share_a_policy_and_have_histories_of_their_own():
     policy = WarmPriorActor(network, prior, nfe=1, **own)
     transforms = policy_transforms(policy, action_key=("agents", "action"))
     env = TransformedEnv(SerialEnv(2, Team), transforms)
+    check_env_specs(TransformedEnv(Team((2,)), policy_transforms(policy, action_key=("agents", "action"))))
+    with pytest.raises(ValueError, match="no group of agents"):
+        late = policy_transforms(policy, action_key=("agents", "action"), delay=1)
+        TransformedEnv(Team(), late).rollout(1)
     rollout = env.rollout(10, policy)
     assert rollout["agents", "chunk"].shape == (2, 3, 3, 2 * H, 2)
     assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
@@ -144,6 +200,15 @@ def test_the_agents_of_a_group_share_a_policy_and_have_histories_of_their_own():
     assert torch.equal(rollout["agents", "history", "actions"][:, 1:], chunk[:, :-1, :, :H])
     returns = chunk[..., :H, :].sum((-1, -3)).cumsum(-1)
     torch.testing.assert_close(rollout["next", "reward"][:, :2, 0], returns[:, :2, -1])
+
+
+def test_a_group_may_live_inside_of_workers():
+    def make_env():
+        return TransformedEnv(Team(), ChunkStep(H, action_keys=[("agents", "action")], chunk_keys=[CHUNK]))
+
+    rollout = SerialEnv(2, make_env).rollout(9)
+    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
+    assert rollout[CHUNK].shape == (2, 3, 3, H, 2)
 
 
 def test_one_key_of_an_environment_works_as_before():

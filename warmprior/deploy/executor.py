@@ -19,7 +19,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.checks import check_between, check_finite, check_shape, check_whole_numbers
 from warmprior.history import advance, cold_history
-from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
@@ -96,6 +96,7 @@ class AsyncExecutor:
             if observation_steps is None:
                 observation_steps = getattr(network, "observation_steps", None)
         observation_steps = 2 if observation_steps is None else observation_steps
+        check_usual_keys(actor, "AsyncExecutor")
         if prior is None or action_dim is None:
             raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
         if latency is not None:

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from warmprior import keys
 from warmprior.checks import (
@@ -21,7 +22,7 @@ from warmprior.checks import (
     check_whole_numbers,
 )
 from warmprior.history import advance
-from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.network import encoded
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation
@@ -63,6 +64,7 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
     bare = "" if policy.ode.guidance is None else "; or measure policy.replace(guidance=None)"
     check_keys(batch, needed, "a batch of windows, or a rollout,", bare)
     check_not_empty(batch)
+    check_usual_keys(policy, "a measure")
     if isinstance(batch.get(observation_key), TensorDictBase):
         raise ValueError(f"{observation_key!r} is not a vector: pass encoded_windows(policy, windows)")
     device = next(policy.parameters()).device
@@ -175,11 +177,11 @@ def check_flow(policy: WarmPriorActor, steps: int) -> None:
 
 @contextmanager
 def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
-    """Without dropout and gradients; restores every module's mode afterwards."""
+    """Without dropout and gradients, with the source's noise; restores every module's mode afterwards."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     try:
-        with torch.no_grad():
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             yield
     finally:
         for module, mode in modes:

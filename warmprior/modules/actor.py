@@ -137,6 +137,16 @@ class PriorSampler(TensorDictModuleBase):
         return history, None if key is None else tensordict.get(key, None)
 
 
+USUAL_KEYS = {"history_key": keys.HISTORY, "source_key": keys.SOURCE, "chunk_key": keys.CHUNK}
+
+
+def check_usual_keys(policy: Any, whose: str) -> None:
+    """Raise ValueError if a policy has keys of its own where only the usual ones are known."""
+    own = getattr(policy, "tensor_keys", USUAL_KEYS)
+    if changes := [f"{name}={key!r}" for name, key in USUAL_KEYS.items() if own[name] != key]:
+        raise ValueError(f"{whose} takes the usual keys: give it policy.replace({', '.join(changes)})")
+
+
 class WarmPriorActor(TensorDictModuleBase):
     """Flow-matching policy with a choice of source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
@@ -163,7 +173,8 @@ class WarmPriorActor(TensorDictModuleBase):
         source_key: where ``"loc"``, ``"warm"`` and ``"noise"`` are written.
         chunk_key: where the chunk is written. With keys of their own, several policies share an environment
             (:class:`~warmprior.ChunkStep`).
-        spec: of the chunk, or of several outputs by key, as of TorchRL's actors; none by default.
+        spec: of the chunk, or of several outputs by key, as of TorchRL's actors; none by default, and not
+            saved.
         **sampling: options of :class:`Sampling`, such as ``nfe`` and ``temperature``; the number of network
             evaluations also per call: ``actor(data, nfe=1)``.
 

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.checks import check_finite_numbers, check_keys
+from warmprior.checks import check_finite_numbers, check_keys, check_whole_numbers
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
@@ -207,6 +207,8 @@ class Sampling:
     temperature: float | None = None
 
     def __post_init__(self) -> None:
+        counts = {"nfe": self.nfe, "max_nfe": self.max_nfe}
+        check_whole_numbers(**{name: value for name, value in counts.items() if value is not None})
         self.evaluations()
         check_grid(self.grid)
         bounds = self.clip if isinstance(self.clip, Sequence) else (1.0 if self.clip is None else self.clip,)

@@ -65,7 +65,7 @@ class Registered:
             parameters = list(inspect.signature(vars(cls)["__init__"]).parameters.values())[1:]
             passed_on = [p for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
             for parameter in (p for p in parameters if p not in passed_on):
-                if parameter.name == "name" or not hasattr(self, parameter.name):
+                if parameter.name == "name" or not _keeps(self, parameter.name):
                     raise TypeError(
                         f"{type(self).__name__} cannot be saved: its constructor must keep the argument "
                         f"{parameter.name!r} as an attribute of this name (and call none 'name')"
@@ -90,8 +90,17 @@ class Registered:
             ) from error
 
     def __repr__(self) -> str:
-        written = (f"{name}={value!r}" for name, value in self.arguments().items())
-        return f"{type(self).__name__}({', '.join(written)})"
+        try:
+            written = ", ".join(f"{name}={value!r}" for name, value in self.arguments().items())
+        except TypeError:
+            written = "..."
+        return f"{type(self).__name__}({written})"
+
+
+def _keeps(part: object, name: str) -> bool:
+    """Whether an object has an attribute of its own of this name, or a property."""
+    default = getattr(type(part), name, part)  # of the class, which says nothing of the object
+    return hasattr(part, name) and (name in vars(part) or default is part or isinstance(default, property))
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:

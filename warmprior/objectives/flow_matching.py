@@ -59,7 +59,8 @@ class FlowMatchingLoss(LossModule):
         generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
 
     .. note::
-        Keys read (renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool ``[*B, P]``
+        Keys read (renameable by :meth:`set_keys`; those of :class:`~warmprior.ActionWindow`, whatever keys of
+        its own the policy has): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool ``[*B, P]``
         (optional), the ``history`` (:mod:`warmprior.history`) and ``observation`` ``[*B, To, d_o]``. Batches
         are moved to the network's device, where the generator has to be.
 

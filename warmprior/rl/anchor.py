@@ -15,7 +15,7 @@ from warmprior import keys
 from warmprior.checks import check_choice
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
-from warmprior.transforms.inner_step import EnvTransform, keep_resting
+from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
 
 def has_anchor(actor: Any) -> bool:
@@ -149,5 +149,6 @@ class PriorAnchor(EnvTransform):
         forecast = unravel_key((self.history_key, "forecast"))
         if forecast not in observation_spec.keys(True, True):
             raise KeyError(f"PriorAnchor found no {forecast}: append it after ActionHistory")
+        check_unwritten(observation_spec, self.out_keys, "PriorAnchor")
         observation_spec[keys.ANCHOR] = observation_spec[forecast].clone()
         return observation_spec

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.init import trunc_normal_
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positive, check_shape
-from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
@@ -34,7 +33,8 @@ class PriorDecoder(TensorDictModuleBase):
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
     :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy, whose parameters
-    take no gradients, and which stays in evaluation mode.
+    take no gradients, and which stays in evaluation mode. Draw the weights of an agent before you put it in
+    front: ``apply`` and ``reset_parameters_recursive`` of the sequence reach the policy too.
 
     Args:
         actor: the policy; copied. Or an object with the same parts, such as
@@ -64,6 +64,7 @@ class PriorDecoder(TensorDictModuleBase):
     def __init__(self, actor: WarmPriorActor, *, delta: float, nfe: int | None = None) -> None:
         super().__init__()
         check_positive(delta=delta)
+        check_usual_keys(actor, "PriorDecoder")
         if actor.sampling.max_nfe == 1:
             raise ValueError(
                 "the policy is trained at t = 0 alone, so it has no flow from a source space to act in"
@@ -134,13 +135,6 @@ class PriorDecoder(TensorDictModuleBase):
     def train(self, mode: bool = True) -> PriorDecoder:
         """Stays in evaluation mode."""
         return super().train(False)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PriorDecoder:
-        # Moves to another device or dtype, which need the children.
-        for part in self._modules.values() if recurse else ():
-            if part is not None:
-                part._apply(fn)
-        return super()._apply(fn, recurse)
 
 
 class PriorSpace(EnvTransform):

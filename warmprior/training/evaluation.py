@@ -19,7 +19,9 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
+from warmprior.checks import check_whole_numbers
 from warmprior.io.workers import torch_threads
+from warmprior.modules.actor import check_usual_keys
 from warmprior.training.parallel import base_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
@@ -156,6 +158,7 @@ def play_episode(
         >>> bool((one.decisions == again.decisions).all())
         True
     """
+    check_usual_keys(policy, "evaluate")
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
     for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
@@ -238,8 +241,8 @@ def evaluate(
     if isinstance(env, Task):
         success, measures = env.success, env.measures
         env = env.env(policy)  # type: ignore[arg-type]
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    check_usual_keys(policy, "evaluate")
+    check_whole_numbers(episodes=episodes)
     if len(env.batch_size) > 1:
         raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
     outcomes: list[Episode] = []

@@ -138,11 +138,13 @@ def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Ten
     tensors = without_compilation(actor.state_dict())
     try:
         with torch.random.fork_rng([]):  # as if nothing had been built
-            _filled(config, tensors)
+            again = policy_config(_filled(config, tensors))
+        if changed := [name for name in config if config[name] != again[name]]:
+            raise ValueError(f"its {changed[0]} would have {again[changed[0]]}, not {config[changed[0]]}")
     except Exception as error:
         raise ValueError(
-            f"a saved {type(actor.network).__name__} could not be loaded again: {error}. Its constructor has "
-            "to build, from the options in its config(), what is to be saved."
+            f"the policy could not be loaded again: {error}. Constructors have to build, from the options in "
+            "config(), what is to be saved"
         ) from error
     return config, tensors
 

@@ -67,7 +67,13 @@ class LateTransforms:
         # An environment reads its action and states alone: other observations may reach it untransformed.
         # A transformed one has transforms of its own, which may read what these write.
         (action_key, *others) = action_keys
-        if others or isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
+        nested = isinstance(action_key, tuple)
+        if (
+            others
+            or nested
+            or isinstance(base, TransformedEnv)
+            or any(type(t) not in _REACH for t in transforms)
+        ):
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
         looked_at = [keys.EEF_POSE for t in transforms if isinstance(t, AbsoluteActions)]
@@ -392,10 +398,11 @@ class ChunkStep(EnvTransform):
                     "before, for instance with UnsqueezeTransform"
                 )
             *agents, width = leaf.shape
+            # First, so that the branch of a group keeps its shape.
+            actions[chunk_key] = leaf.unsqueeze(-2).expand(*agents, self.prediction_length, width).clone()
             del actions[action_key]
             if isinstance(action_key, tuple) and actions[action_key[0]].is_empty():
                 del actions[action_key[0]]  # it would count as an action
-            actions[chunk_key] = leaf.unsqueeze(-2).expand(*agents, self.prediction_length, width).clone()
         return input_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec, Unbounded
 from warmprior import keys
 from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.inner_step import EnvTransform, keep_resting
+from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
@@ -138,6 +138,9 @@ class InferenceDelay(EnvTransform):
         (forecast,) = self.in_keys
         if forecast not in observation_spec.keys(True, True):
             raise KeyError(f"InferenceDelay found no {forecast}: append it after ActionHistory")
+        check_unwritten(observation_spec, self.out_keys, "InferenceDelay")
+        if observation_spec[forecast].ndim > observation_spec.ndim + 2:
+            raise ValueError("InferenceDelay and guidance take no group of agents: leave them out")
         check_delay(self.delay, self.execute, observation_spec[forecast].shape[-2])
         observation_spec[keys.DELAY] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device

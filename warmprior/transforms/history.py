@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 from warmprior import keys
 from warmprior.checks import check_between, check_finite_numbers, check_keys, check_whole_numbers
 from warmprior.history import advance, cold_history, history_keys, without
-from warmprior.transforms.inner_step import EnvTransform, keep_resting
+from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
 
 class ActionHistory(EnvTransform):
@@ -89,6 +89,7 @@ class ActionHistory(EnvTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the history."""
+        check_unwritten(observation_spec, self.out_keys, "ActionHistory")
         for name, value in self._cold(self._check_chunk(), observation_spec).items():
             spec = Unbounded(value.shape, dtype=value.dtype, device=observation_spec.device)
             observation_spec[unravel_key((self.history_key, name))] = spec
@@ -223,6 +224,7 @@ class HistoryObservation(EnvTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""
+        check_unwritten(observation_spec, self.out_keys, "HistoryObservation")
         observation, actions, _ = self._read(observation_spec)
 
         def extend(vector: Unbounded) -> Unbounded:

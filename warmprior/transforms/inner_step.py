@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +14,13 @@ from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 KEPT = "_kept"
 """Where :func:`set_aside` puts observations, at the root of a step's input."""
+
+
+def check_unwritten(observation_spec: Any, names: Iterable[NestedKey], whose: str) -> None:
+    """Raise ValueError if something before a transform writes what it is about to write."""
+    present = observation_spec.keys(True, True)
+    if taken := [name for name in names if name in present]:
+        raise ValueError(f"{whose} would overwrite {taken}: each needs keys of its own in one environment")
 
 
 class EnvTransform(Transform):
