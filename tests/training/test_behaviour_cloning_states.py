@@ -62,7 +62,7 @@ def _actor(network):
     ("network", "error", "said"),
     [
         (Plain, TypeError, "cannot save Plain: only subclasses of VelocityNetwork"),
-        (grown, ValueError, "VelocityMLP could not be loaded again"),
+        (grown, ValueError, "could not be loaded again"),
     ],
 )
 def test_what_cannot_be_saved_is_refused_before_training(tmp_path, network, error, said):
