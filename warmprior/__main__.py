@@ -28,7 +28,7 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
 
 
 def info(args: argparse.Namespace) -> None:
-    """Tell what a saved policy is."""
+    """Print a summary of a saved policy."""
     from warmprior.envs.description import environment_name
     from warmprior.training.saved import policy_config, policy_file
 
