@@ -1,1 +1,1 @@
-"""What the benchmarks share: options, tasks and their demonstrations, methods, jobs, rows and pictures."""
+"""The lab holds what the benchmarks share: options, tasks, methods, jobs, rows and pictures."""

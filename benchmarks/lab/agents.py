@@ -47,7 +47,7 @@ Algorithm = Literal["dsrl-na", "dsrl-sac"]
 
 @dataclass(frozen=True)
 class Arm:
-    """How an agent learns around the frozen policies of a method."""
+    """An arm is an algorithm with a box, around the frozen policies of a method."""
 
     method: Method
     algorithm: str
@@ -171,5 +171,5 @@ def environment(
 
 
 def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
-    """What turns images into features, for agents of a policy that sees images."""
+    """Return the transforms that turn images into features, for agents of a policy that sees images."""
     return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []

@@ -96,7 +96,7 @@ class BridgeCoupling(OTCoupling):
         self.interpolant = BridgeInterpolant(sigma)
 
     def config(self) -> dict[str, Any]:
-        """What it depends on."""
+        """Return the options that the pairs depend on."""
         return {**super().config(), "name": "bridge", "sigma": self.interpolant.sigma}
 
     def assigned(self, cost: Tensor) -> Tensor:

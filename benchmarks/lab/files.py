@@ -16,7 +16,7 @@ class PartialFailure(RuntimeError):
 
 
 ERRORS = (*script.ERRORS, PartialFailure)
-"""What a user can mend: reported without a traceback."""
+"""Errors that a user can mend are reported without a traceback."""
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -36,5 +36,5 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def cache_folder() -> Path:
-    """Where generated files are kept: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
+    """Return the folder of generated files: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
     return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

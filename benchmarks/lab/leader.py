@@ -1,4 +1,4 @@
-"""What the first of several processes does for all of them."""
+"""The first of several processes generates or downloads for all of them."""
 
 from __future__ import annotations
 

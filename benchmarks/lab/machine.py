@@ -1,4 +1,4 @@
-"""What this machine is, and whether a device works here."""
+"""This file describes the machine, and checks that a device works on it."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from warmprior.io.distributed import joined, launched, rank
 from warmprior.io.workers import WorkerError
 
 ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
-"""What a user can mend: reported without a traceback."""
+"""Errors that a user can mend are reported without a traceback."""
 
 
 def run_script(

@@ -54,7 +54,7 @@ class Registered:
             cls.classes[name] = cls
 
     def arguments(self) -> dict[str, Any]:
-        """The constructor's arguments, from the attributes of their names.
+        """Return the constructor's arguments, from the attributes of their names.
 
         A ``TypeError`` names an argument that the object does not keep.
         """
