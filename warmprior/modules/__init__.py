@@ -3,18 +3,14 @@
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
-from warmprior.modules.network import (
-    AdaLNTransformer,
-    ChiTransformer,
-    PlainMLP,
-    VelocityMLP,
-    VelocityNetwork,
-)
+from warmprior.modules.mlp import PlainMLP, VelocityMLP
+from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, Sampling, integrate
 from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.modules.transformers import AdaLNTransformer, ChiTransformer
 
 __all__ = [
     "AdaLNTransformer",
