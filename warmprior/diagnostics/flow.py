@@ -121,7 +121,8 @@ def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
 def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None) -> Tensor:
     """Where a policy's samplers start at windows ``[N]``, ``[N, P, d_a]``."""
     inputs = rows.select(*policy.in_keys)
-    return policy.sampler(inputs, generator=generator)[keys.NOISE]
+    options = {"generator": generator, "temperature": policy.sampling.temperature}
+    return policy.sampler(inputs, **options)[keys.NOISE]
 
 
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:

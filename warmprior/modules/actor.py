@@ -64,7 +64,6 @@ class PriorSampler(TensorDictModuleBase):
     Args:
         prior: the source distribution.
         start: the point from which samplers start, if that is not the source itself.
-        temperature: factor of the source's noise, see :class:`~warmprior.Sampling`.
         observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
             :meth:`~Prior.distribution` read it.
         history_key: key of the history (:mod:`warmprior.history`).
@@ -93,7 +92,6 @@ class PriorSampler(TensorDictModuleBase):
         prior: Prior,
         *,
         start: StartPoint | None = None,
-        temperature: float | None = None,
         observation_key: NestedKey | None = None,
         history_key: NestedKey = keys.HISTORY,
         source_key: NestedKey = keys.SOURCE,
@@ -101,7 +99,7 @@ class PriorSampler(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.prior, self.start, self.generator = prior, start, generator
-        self.temperature, self.history_key = temperature, history_key
+        self.history_key = history_key
         reads = start is not None or type(prior).distribution is not Prior.distribution
         self.observation_key = observation_key if reads else None
         observed = [] if self.observation_key is None else [self.observation_key]
@@ -122,10 +120,15 @@ class PriorSampler(TensorDictModuleBase):
         return self.prior.distribution(*self._inputs(tensordict))
 
     @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Write the mean, the warm positions, and the sample."""
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        generator: torch.Generator | None = None,
+        temperature: float | None = None,
+    ) -> TensorDictBase:
+        """Write the mean, the warm positions, and the sample, with noise of a temperature."""
         source, generator = self.source(tensordict), self.generator if generator is None else generator
-        point = source.sample(generator, noise_factor(self.temperature))
+        point = source.sample(generator, noise_factor(temperature))
         if self.start is not None:
             point = self.start(point, *self._inputs(tensordict))
         for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):
@@ -237,7 +240,6 @@ class WarmPriorActor(TensorDictModuleBase):
         self.sampler = PriorSampler(
             prior,
             start=start,
-            temperature=self.sampling.temperature,
             observation_key=observation_key,
             history_key=history_key,
             source_key=source_key,
@@ -291,7 +293,8 @@ class WarmPriorActor(TensorDictModuleBase):
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
-        return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
+        drawn = self.sampler(tensordict, generator=generator, temperature=self.sampling.temperature)
+        return self.integrate(drawn, nfe=nfe)
 
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
         """Integrate a given source sample, ``[*B, P, d_a]`` under ``(source_key, "noise")``, to the chunk."""
