@@ -18,6 +18,7 @@ from lab.methods import Method
 from lab.options import MeasuredOptions
 from lab.policies import Policy
 from lab.scripted.generate import generate_demonstrations
+from lab.source_errors import mean_error, source_coverage
 from lab.statistics import bootstrap_ratio
 from lab.tasks import demonstrations_of, read_like
 from warmprior import Prior, WarmPriorActor
@@ -26,9 +27,7 @@ from warmprior.diagnostics import (
     branching_bound,
     curvature,
     encoded_windows,
-    mean_error,
     memory_gain,
-    source_coverage,
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history

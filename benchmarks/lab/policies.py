@@ -29,9 +29,10 @@ from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
 from lab.report import read_rows
+from lab.source_errors import mean_revision
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import mean_revision, smoothness
+from warmprior.diagnostics import smoothness
 from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking

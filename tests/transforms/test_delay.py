@@ -9,9 +9,10 @@ import torch
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from lab.source_errors import mean_revision
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
 from warmprior import GaussianPrior, InferenceDelay, PastPrior, PreviewPrior, keys, policy_transforms
-from warmprior.diagnostics import executed_actions, mean_revision, smoothness
+from warmprior.diagnostics import executed_actions, smoothness
 from warmprior.history import ENTRIES
 from warmprior.transforms import executed_chunk
 

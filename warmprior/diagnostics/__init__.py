@@ -1,7 +1,7 @@
 """Measures of flows, of executed actions and of success rates."""
 
+from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.curvature import branching_bound, branching_cost, curvature, flow_paths
-from warmprior.diagnostics.errors import MeanError, action_error, mean_error, mean_revision, source_coverage
 from warmprior.diagnostics.flow import SharedObservations, encoded_windows
 from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, memory_gain, source_leak
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
@@ -13,7 +13,6 @@ from warmprior.diagnostics.statistics import (
 
 __all__ = [
     "HistoryShift",
-    "MeanError",
     "SharedObservations",
     "Smoothness",
     "SourceLeak",
@@ -24,13 +23,10 @@ __all__ = [
     "encoded_windows",
     "executed_actions",
     "flow_paths",
-    "mean_error",
-    "mean_revision",
     "memory_gain",
     "paired_probability_better",
     "probability_better",
     "smoothness",
-    "source_coverage",
     "source_leak",
     "success_posterior",
 ]

@@ -1,81 +1,29 @@
-"""Distance of actions and of the source's mean from the demonstrations, without a simulator."""
+"""How far a source is from the demonstrations, and from what its policy then does."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from warmprior import keys
+from warmprior import Source, WarmPriorActor, keys
 from warmprior.checks import check_keys
-from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, judged, predict
-from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Source
-
-
-def action_error(
-    policy: WarmPriorActor,
-    windows: TensorDictBase,
-    *,
-    nfes: Sequence[int] = (1, 9),
-) -> dict[int, float]:
-    r"""Mean squared error of the executed actions on windows of demonstrations.
-
-    The conditional mean :math:`E[a_1 \mid a_0, o]`, which one step of an exact field returns, has the
-    smallest error; samples from the data's own distribution have up to twice that. So compare policies at one
-    NFE, not one policy at several.
-
-    Args:
-        policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow`;
-            held-out ones for a fair error.
-        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
-
-    Returns:
-        By NFE, ascending and from the same samples of the source, the mean over windows, the first ``H``
-        positions inside the episode and dimensions, in squared normalised action units.
-
-    Raises:
-        KeyError: if the windows lack a key.
-        ValueError: for bad windows, or if the policy allows none of the NFEs.
-        FloatingPointError: if a prediction is NaN or infinite.
-
-    Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations, action_error
-        >>> from warmprior.envs import navigation_demonstrations
-        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
-        >>> windows = SharedObservations(navigation_demonstrations(), 4).windows(untrained.prior)
-        >>> sorted(action_error(untrained, windows))
-        [1, 9]
-    """
-    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat, target, rows, generator = judged(policy, windows)
-    counted = flat.counted[:, : prior.chunk_length, 0]
-    errors = {}
-    with evaluation_mode(policy):
-        a0 = drawn(policy, rows, generator)
-        for nfe in allowed:
-            chunk = predict(policy, rows, a0, nfe)
-            error = (chunk - target)[:, : prior.chunk_length].square()
-            errors[nfe] = float(error[counted].mean())
-    return errors
+from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, judged, predict
 
 
 @dataclass(frozen=True)
 class MeanError:
-    """Root mean squares over warm positions inside the episode and dimensions; NaN if the source has no mean.
+    """Root mean squares over warm positions, inside the episode, are the error; NaN without a mean.
 
     Attributes:
         target: distance of the mean from the demonstrated actions.
         revision: distance of the mean from the policy's prediction.
 
     Examples:
-        >>> from warmprior.diagnostics import MeanError
+        >>> from lab.source_errors import MeanError
         >>> MeanError(target=0.17, revision=0.2)  # see mean_error
         MeanError(target=0.17, revision=0.2)
     """
@@ -90,7 +38,7 @@ def mean_error(
     *,
     nfe: int | None = None,
 ) -> MeanError:
-    """Error of the mean at demonstrated states, in normalised action units.
+    """Measure the error of the mean at demonstrated states, in normalised action units.
 
     Args:
         policy: the policy; its state stays as it is.
@@ -105,7 +53,8 @@ def mean_error(
 
     Examples:
         >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations, mean_error
+        >>> from lab.source_errors import mean_error
+        >>> from warmprior.diagnostics import SharedObservations
         >>> from warmprior.envs import navigation_demonstrations
         >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1), PreviewPrior(4))
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
@@ -121,7 +70,7 @@ def mean_error(
 
 
 def mean_revision(rollout: TensorDictBase) -> float:
-    """Distance of the mean from the policy's next prediction, along rollouts.
+    """Measure the distance of the mean from the policy's next prediction, along rollouts.
 
     If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the
     states that the policy reaches than in the demonstrations.
@@ -138,7 +87,7 @@ def mean_revision(rollout: TensorDictBase) -> float:
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior.diagnostics import mean_revision
+        >>> from lab.source_errors import mean_revision
         >>> rollout = TensorDict({  # forecasts 2, 3, then predicts 2, 5
         ...     "vla_action": {"chunk": torch.tensor([[2.0, 5, 0, 0]])[..., None]},
         ...     "prior": {"loc": torch.tensor([[2.0, 3, 0, 0]])[..., None],
@@ -157,7 +106,7 @@ def _rms(values: Tensor) -> float:
 
 
 def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: float = 0.9) -> float:
-    r"""Share of the target's coordinates inside the central interval of a Gaussian source.
+    r"""Return the share of the target's coordinates inside the central interval of a Gaussian source.
 
     A calibrated source covers ``level``. One that covers less trusts its mean too much; one that covers
     everything is too wide, as N(0, I) is for normalised actions.
@@ -177,7 +126,8 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
 
     Examples:
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations, source_coverage
+        >>> from lab.source_errors import source_coverage
+        >>> from warmprior.diagnostics import SharedObservations
         >>> from warmprior.envs import navigation_demonstrations
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
         >>> source_coverage(actor, SharedObservations(navigation_demonstrations(), 4).windows(actor.prior))

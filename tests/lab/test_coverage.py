@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lab.learned_sources import CVAEPrior
+from lab.source_errors import source_coverage
 from tests.diagnostics.fields import D_A, H, remember, targets
 from warmprior import PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
-from warmprior.diagnostics import source_coverage
 
 N = 20_000
 

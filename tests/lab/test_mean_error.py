@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 
 from lab.learned_sources import CVAEPrior, ForecastPrior
+from lab.source_errors import mean_error, mean_revision
 from tests.diagnostics.fields import D_A, H, policy, remember, targets
 from warmprior import PastPrior, PreviewPrior
-from warmprior.diagnostics import mean_error, mean_revision
 
 
 def still(t, a, observation):
