@@ -21,8 +21,8 @@ from lab.files import PartialFailure, read_lines
 from lab.methods import label
 from lab.options import IMAGES, Options, with_parts
 from lab.paper import paper_success
-from lab.statistics import top_k_mean
-from warmprior import diagnostics as stats
+from lab.statistics import paired_probability_better, probability_better, top_k_mean
+from warmprior.diagnostics import success_posterior
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
 
@@ -106,7 +106,7 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     found = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
     found = found.assign(seeds=groups.size()).join(groups[measures].mean()).join(spread).reset_index()
     counts = found[["successes", "episodes"]].to_numpy()
-    intervals = [stats.success_posterior(*map(int, pair)).interval(0.95) for pair in counts]
+    intervals = [success_posterior(*map(int, pair)).interval(0.95) for pair in counts]
     found["low"], found["high"] = zip(*intervals, strict=True)
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
     found["paper"] = [paper_success(row) for row in firsts]
@@ -124,7 +124,7 @@ def _beside(found: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFram
     found["one_sigma"] = found["gain"] > deviations[0] + deviations[1]
     pairs = found[["successes", "episodes"]].join(theirs[["successes", "episodes"]], rsuffix="_first")
     found["better"] = [
-        stats.probability_better(*map(int, counts)) if not math.isnan(gain) else math.nan
+        probability_better(*map(int, counts)) if not math.isnan(gain) else math.nan
         for counts, gain in zip(pairs.to_numpy(), found["gain"], strict=True)
     ]
     # Episodes of equal seeds, of trainings with equal seeds.
@@ -136,7 +136,7 @@ def _beside(found: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFram
     both["lost"] = [pairs.count(("0", "1")) for pairs in outcomes]
     found = found.join(both.groupby(list(keys))[["won", "lost"]].sum(), on=list(keys))
     found["paired"] = [
-        math.nan if math.isnan(won) else stats.paired_probability_better(int(won), int(lost))
+        math.nan if math.isnan(won) else paired_probability_better(int(won), int(lost))
         for won, lost in found[["won", "lost"]].to_numpy()
     ]
     # A flow is the same at any NFE, and the baseline may lack this one.
@@ -242,7 +242,7 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
             name = others["success"].idxmax()
             counts = totals.loc[[name, first], ["successes", "episodes"]].to_numpy().flatten()
             gain = totals.loc[name, "success"] - totals.loc[first, "success"]
-            chance = stats.probability_better(*map(int, counts))
+            chance = probability_better(*map(int, counts))
             chances.append(f"{name} {gain:+.1%}, {chance:.2f} at NFE {nfe}")
     where = f"{len(problems)} problems ({', '.join(problems)})" if len(problems) > 1 else problems[0]
     lines = [

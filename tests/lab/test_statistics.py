@@ -7,7 +7,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.statistics import bootstrap_ratio, top_k_mean
+from lab.statistics import (
+    bootstrap_ratio,
+    paired_probability_better,
+    probability_better,
+    top_k_mean,
+)
 
 rates = st.lists(st.floats(0, 1), min_size=1, max_size=8)
 
@@ -48,3 +53,24 @@ def test_bootstrap_draws_whole_groups():
     repeated = width(x.repeat(9), y.repeat(9), groups.repeat(9))
     assert repeated == pytest.approx(once)
     assert width(x.repeat(9), y.repeat(9), torch.arange(270)) < 0.5 * once
+
+
+@given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 60), st.integers(0, 60))
+def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, n_b):
+    np, stats = pytest.importorskip("numpy"), pytest.importorskip("scipy.stats")
+    k_a, k_b = min(k_a, n_a), min(k_b, n_b)
+    a, b = stats.beta(k_a + 1, n_a - k_a + 1), stats.beta(k_b + 1, n_b - k_b + 1)
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    p = (nodes + 1) / 2
+    expected = float((weights / 2 * a.pdf(p) * b.cdf(p)).sum())
+    assert probability_better(k_a, n_a, k_b, n_b) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("wins", "losses"), [(0, 0), (7, 2), (0, 5), (40, 41), (900, 100)])
+def test_paired_probability_is_that_of_a_beta(wins, losses):
+    stats = pytest.importorskip("scipy.stats")
+    found = paired_probability_better(wins, losses)
+    assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
+    assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="at least 0"):
+        paired_probability_better(-1, losses)

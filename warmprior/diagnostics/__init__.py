@@ -5,11 +5,7 @@ from warmprior.diagnostics.curvature import branching_bound, branching_cost, cur
 from warmprior.diagnostics.flow import SharedObservations, encoded_windows
 from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, memory_gain, source_leak
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
-from warmprior.diagnostics.statistics import (
-    paired_probability_better,
-    probability_better,
-    success_posterior,
-)
+from warmprior.diagnostics.statistics import success_posterior
 
 __all__ = [
     "HistoryShift",
@@ -24,8 +20,6 @@ __all__ = [
     "executed_actions",
     "flow_paths",
     "memory_gain",
-    "paired_probability_better",
-    "probability_better",
     "smoothness",
     "source_leak",
     "success_posterior",
