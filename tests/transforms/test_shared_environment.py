@@ -75,40 +75,30 @@ def own(name):
     return {"chunk_key": (name, "chunk"), "history_key": (name, "history")}
 
 
-def test_two_policies_act_side_by_side():
-    torch.manual_seed(0)
-    left, right = actor(PastPrior(H), 1, "left"), actor(GaussianPrior(H), 2, "other")
-    base = TwoArms()
-    chunks = ChunkStep(
-        H,
-        action_keys=[("left", "action"), "right"],
-        chunk_keys=[("left", "chunk"), ("other", "chunk")],
-    )
-    histories = (
-        ActionHistory(H, chunk_key=(name, "chunk"), history_key=(name, "history"))
-        for name in ("left", "other")
-    )
-    env = TransformedEnv(base, Compose(ObservationStack(1), chunks, *histories))
-    check_env_specs(env)
-    rollout = env.rollout(10, TensorDictSequential(left, right))
-    assert rollout["next", "executed_steps"].flatten().tolist() == [3, 3, 1]
-    assert rollout["next", "reward"].sum() == LENGTH
-    for key, played in {"left": [a for a, _ in base.played], "other": [b for _, b in base.played]}.items():
-        whole = rollout[key, "chunk"].flatten(0, 1)[:LENGTH]
-        assert torch.equal(whole, torch.stack(played))
-        assert torch.equal(rollout[key, "history", "actions"][1:], rollout[key, "chunk"][:-1])
-    assert torch.equal(rollout["left", "source", "loc"][1:], rollout["left", "chunk"][:-1])
-    assert not rollout["other", "source", "warm"].any()
-
-
 def histories_of(*names):
-    return [ActionHistory(H, chunk_key=(n, "chunk"), history_key=(n, "history")) for n in names]
+    return [ActionHistory(H, **own(name)) for name in names]
 
 
 def two_arms(*more):
     chunks = [("left", "chunk"), ("other", "chunk")]
     step = ChunkStep(H, action_keys=[("left", "action"), "right"], chunk_keys=chunks)
     return TransformedEnv(TwoArms(), Compose(ObservationStack(1), step, *more))
+
+
+def test_two_policies_act_side_by_side():
+    torch.manual_seed(0)
+    left, right = actor(PastPrior(H), 1, "left"), actor(GaussianPrior(H), 2, "other")
+    env = two_arms(*histories_of("left", "other"))
+    check_env_specs(env)
+    rollout = env.rollout(10, TensorDictSequential(left, right))
+    assert rollout["next", "executed_steps"].flatten().tolist() == [3, 3, 1]
+    assert rollout["next", "reward"].sum() == LENGTH
+    for key, played in zip(("left", "other"), zip(*env.base_env.played, strict=True), strict=True):
+        whole = rollout[key, "chunk"].flatten(0, 1)[:LENGTH]
+        assert torch.equal(whole, torch.stack(played))
+        assert torch.equal(rollout[key, "history", "actions"][1:], rollout[key, "chunk"][:-1])
+    assert torch.equal(rollout["left", "source", "loc"][1:], rollout["left", "chunk"][:-1])
+    assert not rollout["other", "source", "warm"].any()
 
 
 @pytest.mark.parametrize(
