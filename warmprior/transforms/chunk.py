@@ -64,17 +64,14 @@ class LateTransforms:
     ) -> LateTransforms | None:
         """Return such steps, or ``None`` where ``read`` needs every transform to run at every step."""
         transforms, base = step.transforms, step.base
-        # An environment reads its action and states alone: other observations may reach it untransformed.
-        # A transformed one has transforms of its own, which may read what these write.
         (action_key, *others) = action_keys
-        nested = isinstance(action_key, tuple)
-        if (
-            others
-            or nested
-            or isinstance(base, TransformedEnv)
-            or any(type(t) not in _REACH for t in transforms)
-        ):
+        # The lean loop sets one entry at the root. A transformed environment has transforms of its own, which
+        # may read what these write.
+        if others or isinstance(action_key, tuple) or isinstance(base, TransformedEnv):
             return None
+        if any(type(transform) not in _REACH for transform in transforms):
+            return None
+        # An environment reads its action and states alone: other observations may reach it untransformed.
         written = _roots(key for t in transforms for key in t.out_keys)
         looked_at = [keys.EEF_POSE for t in transforms if isinstance(t, AbsoluteActions)]
         needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
