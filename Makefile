@@ -52,7 +52,7 @@ test-groot-n15: $(GROOT)/installed
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy warmprior
+	$(BIN)/mypy
 
 fuzz: install
 	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)

@@ -36,6 +36,12 @@ def window_histories(actions, frames, chunk_length):
     return window(TensorDict({"frame": frames}, frames.shape))["history"]
 
 
+def ends_of(*batch):
+    """The specification of an episode's ends."""
+    names = ("done", "terminated", "truncated")
+    return Composite({n: Categorical(2, dtype=torch.bool, shape=(*batch, 1)) for n in names}, shape=batch)
+
+
 class CountingEnv(EnvBase):
     """Observation ``[step, episode, *last action]``; reward ``step`` at each step; ends after ``length``."""
 
@@ -45,10 +51,12 @@ class CountingEnv(EnvBase):
         self.observation_spec = Composite(observation=Unbounded((2 + ACTION_DIM,)))
         self.action_spec = Bounded(-1, 1, (ACTION_DIM,))
         self.reward_spec = Unbounded((1,))
-        self.done_spec = Composite(
-            {key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in ("done", "terminated", "truncated")}
-        )
+        self.done_spec = ends_of()
         self.t, self.episode = 0, -1
+
+    def _seen(self, out: TensorDict) -> TensorDict:
+        """Of classes that show more than this one: what a reset or a step returns."""
+        return out
 
     def _observation(self, action: torch.Tensor) -> torch.Tensor:
         return torch.cat([torch.tensor([float(self.t), float(self.episode)]), action])
@@ -57,22 +65,20 @@ class CountingEnv(EnvBase):
         self.t = 0
         self.episode += 1
         out = TensorDict({"observation": self._observation(torch.zeros(ACTION_DIM))}, [])
-        return out.update(self.full_done_spec.zero())
+        return self._seen(out.update(self.full_done_spec.zero()))
 
     def _step(self, tensordict):
         self.t += 1
         done = torch.tensor([self.t >= self.length])
         never = torch.zeros(1, dtype=torch.bool)
-        return TensorDict(
-            {
-                "observation": self._observation(tensordict["action"]),
-                "reward": torch.tensor([float(self.t)]),
-                "done": done,
-                "terminated": never if self.truncate else done,
-                "truncated": done if self.truncate else never,
-            },
-            [],
-        )
+        out = {
+            "observation": self._observation(tensordict["action"]),
+            "reward": torch.tensor([float(self.t)]),
+            "done": done,
+            "terminated": never if self.truncate else done,
+            "truncated": done if self.truncate else never,
+        }
+        return self._seen(TensorDict(out, []))
 
     def _set_seed(self, seed):
         return seed

@@ -47,7 +47,7 @@ def compare(
         rows.sort(key=order)
         write_rows(path, rows)
 
-    path = options.run.out / "results.jsonl"
+    path = options.run.folder / "results.jsonl"
     rows = read_lines(path) if path.exists() else []
     if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(
@@ -95,7 +95,7 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     tasks = {policy.place: policy.task() for policy in policies}.values()
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
-        write_atomic(options.run.out / "tasks.json", lambda path: path.write_text(text))
+        write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
 
     failures = {}
     for policy in policies if world_size() > 1 else ():
@@ -138,9 +138,9 @@ def submit(
             jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
 
     group = str(policy)
-    training = {"training": True, "status": policy.status, "then": trained, "group": group}
+    training: dict[str, Any] = {"training": True, "status": policy.status, "then": trained, "group": group}
     first = jobs.submit(f"train {policy}", train, policy, **training)
-    after = {"after": first, "group": group}
+    after: dict[str, Any] = {"after": first, "group": group}
     if any(cell.checkpoint == last for cell in cells):
         jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)

@@ -36,6 +36,7 @@ class Learner(nn.Module):
     sees_history: ClassVar[bool] = True
     sees_observation: ClassVar[bool] = True
     heads: ClassVar[int] = 1  # chunks that the network says
+    chunk_length: int
     chunk_dim: int  # numbers in a chunk, H d_a
     seen_dim: int  # numbers that the network is given
 
@@ -65,7 +66,7 @@ class Learner(nn.Module):
     def mlp(self, inputs: int, outputs: int) -> MLP:
         return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
 
-    def seen(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+    def seen(self, history: TensorDictBase, observation: Any) -> Tensor:
         """What the network is given, ``[*B, seen_dim]``."""
         parts = [observation.flatten(-2)] if self.sees_observation else []
         if self.sees_history:
@@ -115,6 +116,8 @@ class ForecastPrior(LearnedPrior):
     ``sigma`` multiplies the result.
     """
 
+    calibration: Tensor
+    typical_scale: Tensor
     name = "forecast"
     default_sigma = 1.0
     heads = 2  # mean and scale
@@ -235,7 +238,7 @@ class CVAEPrior(LearnedPrior):
             like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
             z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
             loc = self.decode(seen, z if temperature == 1.0 else temperature * z)
-            return replace(source, loc=loc, scale=self.sigma).sample(generator, temperature)
+            return replace(source, loc=loc, scale=loc.new_tensor(self.sigma)).sample(generator, temperature)
 
         return Drawn(source.loc, source.scale, source.warm, by=decoded)
 

@@ -108,7 +108,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
     facts, device, count = task.facts, options.run.device, options.observations
     given, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
-    shape = {"observation_steps": policy.network.observation_steps}
+    shape: dict[str, Any] = {"observation_steps": policy.network.observation_steps}
     if task.normalizer is None or "file" not in facts:
         if given is not None:
             raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
@@ -179,11 +179,11 @@ def straightness(
     first = [values for values, _ in measured[next(iter(policies)), "training"]]
     rows = []
     for (method, mean), found in measured.items():
-        parts = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
+        parts: list[Any] = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
         if len(seeds) > 1:
-            values, limits = zip(*found, strict=True)
+            every = zip(*found, strict=True)
             # NaN where any predicts no motion: the others alone would be no average over the seeds.
-            averages = (torch.stack(one).mean(0) for one in (values, limits, first))
+            averages = (torch.stack(list(one)).mean(0) for one in (*every, first))
             parts.append((None, *averages))
         for s, values, limits, baseline in parts:
             rows.append(

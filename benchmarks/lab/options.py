@@ -127,9 +127,15 @@ class Run:
             raise ValueError(f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda")
 
     @property
+    def folder(self) -> Path:
+        """The output folder, which `parse` has chosen where none was given."""
+        assert self.out is not None
+        return self.out
+
+    @property
     def policies(self) -> Path:
         """Where policies lie: beside the run, so that others share them."""
-        return self.out.absolute().parent / "policies"
+        return self.folder.absolute().parent / "policies"
 
 
 @dataclass(frozen=True)
@@ -439,7 +445,7 @@ def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O
         raise ValueError(
             f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
         )
-    tree = stored.get("options")
+    tree: Any = stored.get("options")
     if study is None and isinstance(tree, dict):
         tree = {part: value for part, value in tree.items() if part in {f.name for f in fields(kind)}}
     try:
@@ -480,7 +486,7 @@ def script(
 @contextmanager
 def started(options: Options, study: str) -> Iterator[Path]:
     """The output folder, with the options in it, and without another process."""
-    out = options.run.out
+    out = options.run.folder
     if rank():  # the first process is in it, for all
         yield out
         return

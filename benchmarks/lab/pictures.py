@@ -22,7 +22,7 @@ from warmprior.training import record_filmstrip
 def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> None:
     """Per task: posteriors of the success rates, learning curves, and an episode of every method."""
     tasks = list(dict.fromkeys((p.facts["task"], p.facts["data"]) for p in policies))
-    out = options.run.out
+    out = options.run.folder
     for task, style in tasks:
         end = f"_{task}_{style}" if len(tasks) > 1 else ""
         mine = labelled(rows[(rows.task == task) & (rows.data == style)])
@@ -55,7 +55,7 @@ def film(options: Options, policy: Policy, method: str, end: str) -> None:
     """The first evaluation episode of a policy, in pictures and, with PyAV, as a film."""
     nfe, task = min(policy.method.nfes(options.evaluation.nfe)), policy.task()
     slug = re.sub(r"[^\w.]+", "-", method if "," in method else policy.method.name)
-    video = options.run.out / f"film_{slug}{end}.mp4"
+    video = options.run.folder / f"film_{slug}{end}.mp4"
     own: dict[str, Any] = options.evaluation.environment
     if task.environment is None:
         own = {"env": task.env(policy.load()), "rate": task.film_rate, "success": task.success}
@@ -71,6 +71,6 @@ def film(options: Options, policy: Policy, method: str, end: str) -> None:
     plot_filmstrip(
         strip.frames,
         [f"step {step}" for step in strip.steps],
-        options.run.out / f"filmstrip_{slug}{end}.png",
+        options.run.folder / f"filmstrip_{slug}{end}.png",
         title=f"{method}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
     )

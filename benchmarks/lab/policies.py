@@ -120,7 +120,7 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    run = replace(options.run, out=options.run.out.absolute())
+    run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
@@ -226,7 +226,7 @@ def train(policy: Policy) -> None:
             if isinstance(part, Learner):
                 with leader_first():
                     learned(part, policy, training)
-        logger, logs = None, str(policy.run.out / "logs")
+        logger, logs = None, str(policy.run.folder / "logs")
         if policy.run.logger != "none" and not rank():
             logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
         # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
@@ -346,9 +346,10 @@ class Cell:
 def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
     """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
     actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
-    task, noise = policy.task(), {"nfe": cell.nfe, "policy_seed": policy.training.seed}
-    outcome = {"success": task.success, "measures": task.measures}
-    return [play_episode(actor, env, episode, **noise, **outcome) for episode in seeds]
+    task = policy.task()
+    outcome: dict[str, Any] = {"success": task.success, "measures": task.measures}
+    outcome |= {"nfe": cell.nfe, "policy_seed": policy.training.seed}
+    return [play_episode(actor, env, episode, **outcome) for episode in seeds]
 
 
 @lru_cache(maxsize=1)

@@ -218,7 +218,8 @@ def robosuite_task(
     # A generated file has as many as were asked for, and what is no file given is of the task asked for.
     demos = None if source == "scripted" else options.first(style)
     named = next(iter(options.task), None) if source == "file" else None
-    seen, place = {}, path
+    seen: dict[str, Any] = {}
+    place = path
     if options.obs == "image":
         index = opened(path, named, options.mask).index(demos=demos)
         cameras = options.cameras or (index.task.cameras if index.task else index.cameras)

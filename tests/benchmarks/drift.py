@@ -7,50 +7,45 @@ from dataclasses import replace
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from tests.benchmarks.script_parts import command_line
+from tests.toy_env import CountingEnv
 from warmprior import PastPrior
 from warmprior.training import Task
 
 H, OBSERVATION_DIM, ACTION_DIM = 4, 19, 7
 
 
-class DriftEnv(EnvBase):
+class DriftEnv(CountingEnv):
     """A state that drifts with the actions from a start by seed; the task is to go to one side.
 
     Episodes last 9 to 15 steps. It measures how far it is on that side.
     """
 
     def __init__(self) -> None:
-        super().__init__(device="cpu", batch_size=[])
+        super().__init__(length=9)
         self.seed_ = 0
         flag = Categorical(2, dtype=torch.bool, shape=(1,))
-        seen = {"observation": Unbounded((OBSERVATION_DIM,)), "solved": flag.clone(), "side": Unbounded((1,))}
+        seen = {"observation": Unbounded((OBSERVATION_DIM,)), "solved": flag, "side": Unbounded((1,))}
         self.observation_spec = Composite(seen)
         self.action_spec = Bounded(-1, 1, (ACTION_DIM,))
-        self.reward_spec = Unbounded((1,))
-        self.done_spec = Composite({k: flag.clone() for k in ("done", "terminated", "truncated")})
 
     def _set_seed(self, seed):
-        self.seed_ = seed
+        self.seed_, self.length = seed, 9 + seed % 7
 
-    def _says(self, **more):
-        done, side = torch.tensor([self.left == 0]), self.state[:ACTION_DIM].sum().reshape(1)
-        ends = {"done": done, "terminated": done, "truncated": torch.zeros(1, dtype=torch.bool)}
-        seen = {"observation": self.state.clone(), "solved": done & (side > 0), "side": side}
-        return TensorDict(seen | ends | more, [])
+    def _seen(self, out):
+        side = self.state[:ACTION_DIM].sum().reshape(1)
+        return out.update(
+            {"observation": self.state.clone(), "solved": out["done"] & (side > 0), "side": side}
+        )
 
     def _reset(self, tensordict=None, **kwargs):
-        self.left = 9 + self.seed_ % 7
         self.state = torch.randn(OBSERVATION_DIM, generator=torch.Generator().manual_seed(self.seed_))
-        return self._says()
+        return super()._reset(tensordict)
 
     def _step(self, tensordict):
-        self.left -= 1
-        self.state = self.state.clone()
         self.state[:ACTION_DIM] += 0.4 * tensordict["action"]
-        return self._says(reward=torch.zeros(1))
+        return super()._step(tensordict)
 
 
 def demonstrations(seed=0):

@@ -6,50 +6,38 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
+from tests.toy_env import CountingEnv
 from warmprior import PastPrior, PreviewPrior, policy_transforms
 from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor
 from warmprior.rl import PriorDecoder
 
 
-class Arm(EnvBase):
-    """A state that sums up actions, and a picture of it; ends after ``length`` steps."""
+class Arm(CountingEnv):
+    """A state that sums up actions, and a picture of it."""
 
-    def __init__(self, length: int = 20, picture: bool = True) -> None:
-        super().__init__(device="cpu")
-        self.length, self.picture = length, picture
-        seen = {"state": Unbounded((STATE,))}
-        if picture:
-            seen["top"] = Bounded(0, 255, (3, 64, 64), dtype=torch.uint8)
+    def __init__(self) -> None:
+        super().__init__(length=20)
+        seen = {"state": Unbounded((STATE,)), "top": Bounded(0, 255, (3, 64, 64), dtype=torch.uint8)}
         self.observation_spec = Composite(observation=Composite(**seen))
         self.action_spec = Unbounded((ACTION,))
-        self.reward_spec = Unbounded((1,))
-        self.at, self.steps = torch.zeros(STATE), 0
-
-    def _observed(self):
-        seen = {"state": self.at.clone()}
-        if self.picture:
-            seen["top"] = torch.full((3, 64, 64), self.steps, dtype=torch.uint8)
-        return TensorDict({"observation": TensorDict(seen, [])}, [])
 
     def _reset(self, tensordict=None, **kwargs):
-        self.at, self.steps = torch.zeros(STATE), 0
-        return self._observed().update(self.full_done_spec.zero())
+        self.at = torch.zeros(STATE)
+        return super()._reset(tensordict)
 
     def _step(self, tensordict):
         self.at = self.at + tensordict["action"][:STATE]
-        self.steps += 1
-        done = torch.tensor([self.steps >= self.length])
-        results = {"reward": torch.zeros(1), "done": done, "terminated": done}
-        return self._observed().update(results)
+        return super()._step(tensordict)
 
-    def _set_seed(self, seed):
-        return seed
+    def _seen(self, out):
+        seen = {"state": self.at.clone(), "top": torch.full((3, 64, 64), self.t, dtype=torch.uint8)}
+        return out.set("observation", TensorDict(seen, []))
 
 
 NAMES = {"state": "observation.state", "top": CAMERA}
@@ -77,15 +65,12 @@ def actor_of(made, prior, **options):
     return LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed, generator=generator, **options)
 
 
-def environment(prior, base=None):
-    return TransformedEnv(Arm() if base is None else base, policy_transforms(prior, observation_steps=1))
-
-
 @pytest.mark.parametrize("family", ["smolvla", "xvla"])
 @pytest.mark.parametrize("prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)])
 def test_rollouts_start_from_the_mean(policy, family, prior):
     made = policy(family)
-    env, actor = environment(prior), actor_of(made, prior)
+    env = TransformedEnv(Arm(), policy_transforms(prior, observation_steps=1))
+    actor = actor_of(made, prior)
     check_env_specs(env)
     with watch(family, made) as seen:
         rollout = env.rollout(4, actor, break_when_any_done=False)

@@ -8,10 +8,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.rl.training_parts import SolvableEnv
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     ActionHistory,
@@ -47,13 +47,17 @@ def make_decoder(prior, delta=DELTA):
     return PriorDecoder(make_actor(prior), delta=delta)
 
 
-def make_env(prior, decoder=None, batched=SerialEnv, truncate=False, **options):
+def transforms_of(prior, decoder=None, **options):
     transforms = policy_transforms(prior, observation_steps=TO, **options)
     transforms.append(PriorAnchor(make_actor(prior)))
     if decoder is not None:
         transforms.append(PriorSpace(decoder))
+    return transforms
+
+
+def make_env(prior, decoder=None, batched=SerialEnv, truncate=False, **options):
     base = batched(2, [partial(CountingEnv, n, truncate) for n in LENGTHS])
-    return TransformedEnv(base, transforms)
+    return TransformedEnv(base, transforms_of(prior, decoder, **options))
 
 
 @pytest.mark.parametrize(("collect", "execute"), [(False, H), (True, 2)])
@@ -107,26 +111,9 @@ def test_specs_and_random_actions(batched):
         env.close(raise_if_closed=False)
 
 
-class SolvedEnv(CountingEnv):
-    """One that says whether it is solved: never."""
-
-    def __init__(self, length):
-        super().__init__(length)
-        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
-
-    def _reset(self, tensordict=None, **kwargs):
-        return super()._reset(tensordict, **kwargs).set("success", torch.zeros(1, dtype=torch.bool))
-
-    def _step(self, tensordict):
-        return super()._step(tensordict).set("success", torch.zeros(1, dtype=torch.bool))
-
-
 def test_an_episode_of_an_agent_has_the_decoded_chunks():
     prior = PastPrior(H)
-    transforms = policy_transforms(prior, observation_steps=TO)
-    transforms.append(PriorAnchor(make_actor(prior)))
-    transforms.append(PriorSpace(make_decoder(prior)))
-    env = TransformedEnv(SolvedEnv(LENGTHS[0]), transforms)
+    env = TransformedEnv(SolvableEnv(LENGTHS[0]), transforms_of(prior, make_decoder(prior)))
     agent = make_prior_space_actor(ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8)
     decisions = play_episode(agent, env, seed=0).decisions
     assert decisions["vla_action", "chunk"].shape[-2:] == (H, ACTION_DIM)

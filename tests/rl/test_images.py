@@ -37,15 +37,10 @@ class CameraEnv(SolvableEnv):
         image = Bounded(0, 255, IMAGE, dtype=torch.uint8)
         self.observation_spec["observation"] = Composite(state=Unbounded((STATE,)), cam=image)
 
-    def _arrange(self, out):
+    def _seen(self, out):
         image = torch.full(IMAGE, 20 * self.t, dtype=torch.uint8)
-        return out.set("observation", TensorDict({"state": out["observation"], "cam": image}, []))
-
-    def _reset(self, tensordict=None, **kwargs):
-        return self._arrange(super()._reset(tensordict))
-
-    def _step(self, tensordict):
-        return self._arrange(super()._step(tensordict))
+        seen = TensorDict({"state": out["observation"], "cam": image}, [])
+        return super()._seen(out).set("observation", seen)
 
 
 class Counted(ImageEncoder):

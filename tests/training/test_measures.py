@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.data import Categorical, Unbounded
+from torchrl.envs import SerialEnv, TransformedEnv
 
-from tests.toy_env import ACTION_DIM, ChunkPolicy
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
 from warmprior import PastPrior, policy_transforms
 from warmprior.training import evaluate, play_episode
 
@@ -27,37 +26,23 @@ def length(seed):
     return 5 + seed % 4  # 5 to 8 steps: 7 or 5 end inside a chunk
 
 
-class Saying(EnvBase):
+class Saying(CountingEnv):
     """Says what :func:`values` has, whatever is done; what it says at the reset counts for nothing."""
 
     def __init__(self):
-        super().__init__(device="cpu", batch_size=[])
-        flag = {"dtype": torch.bool, "shape": (1,)}
-        self.observation_spec = Composite(
-            observation=Unbounded((1,)), won=Categorical(2, **flag), **{name: Unbounded((1,)) for name in HOW}
-        )
-        self.action_spec = Unbounded((ACTION_DIM,))
-        self.reward_spec = Unbounded((1,))
-        names = ("done", "terminated", "truncated")
-        self.done_spec = Composite({name: Categorical(2, **flag) for name in names})
+        super().__init__(length(0))
+        for name in HOW:
+            self.observation_spec[name] = Unbounded((1,))
+        self.observation_spec["won"] = Categorical(2, dtype=torch.bool, shape=(1,))
         self.seed_ = 0
 
     def _set_seed(self, seed):
-        self.seed_ = seed
+        self.seed_, self.length = seed, length(seed)
 
-    def _says(self, said, done):
-        flags = {name: torch.tensor([done]) for name in ("done", "terminated")}
-        flags |= {"truncated": torch.tensor([False]), "observation": torch.zeros(1)}
-        return TensorDict(flags | {name: torch.tensor([value]) for name, value in said.items()}, [])
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.t = 0
-        return self._says({"high": 1e6, "effort": 1e6, "left": 1e6, "won": True}, False)
-
-    def _step(self, tensordict):
-        self.t += 1
-        said = self._says(values(self.seed_, self.t), self.t == length(self.seed_))
-        return said.set("reward", torch.zeros(1))
+    def _seen(self, out):
+        at_reset = {"high": 1e6, "effort": 1e6, "left": 1e6, "won": True}
+        said = values(self.seed_, self.t) if self.t else at_reset
+        return out.update({name: torch.tensor([value]) for name, value in said.items()})
 
 
 def by_hand(seed, executed=H):

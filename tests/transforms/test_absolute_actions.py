@@ -10,10 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, ExcludeTransform, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import ExcludeTransform, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior
 from warmprior.modules.normalize import Normalizer
 from warmprior.transforms import AbsoluteActions, policy_transforms
@@ -86,46 +87,34 @@ def test_far_targets_are_approached_at_full_speed(position, here, target, now):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-class Gripper(EnvBase):
+class Gripper(CountingEnv):
     """Moves exactly as its action says, from a start that its seed decides."""
 
-    def __init__(self, horizon=HORIZON, seed=0):
-        super().__init__(batch_size=[])
-        self.horizon, self.start = horizon, seed
+    def __init__(self, horizon=HORIZON):
+        super().__init__(horizon)
+        self.start = 0
         self.observation_spec = Composite(observation=Unbounded((4,)), eef_pose=Unbounded((1, 3, 4)))
         self.action_spec = Bounded(-1, 1, (7,))
-        self.reward_spec = Unbounded((1,))
-        flags = ("done", "terminated", "truncated")
-        self.done_spec = Composite({key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in flags})
 
-    def _read(self):
+    def _seen(self, out):
         pose = torch.from_numpy(pose_of(self.position, self.rotation)).float()
-        done = torch.tensor([self.steps >= self.horizon])
         gripper = torch.tensor([self.fingers], dtype=torch.float32)
-        return TensorDict(
-            {
-                "observation": torch.cat([pose[:, 3], gripper]),
-                "eef_pose": pose[None],
-                "done": done,
-                "terminated": done.clone(),
-                "truncated": torch.zeros(1, dtype=torch.bool),
-            }
-        )
+        return out.update({"observation": torch.cat([pose[:, 3], gripper]), "eef_pose": pose[None]})
 
     def _reset(self, tensordict=None, **kwargs):
         rng = np.random.default_rng(self.start)
         self.start += 1
         self.position, self.rotation = rng.normal(size=3), Rotation.random(random_state=self.start)
-        self.steps, self.fingers = 0, 0.0
-        return self._read()
+        self.fingers = 0.0
+        return super()._reset(tensordict)
 
     def _step(self, tensordict):
         action = tensordict["action"].double().numpy()
         assert action.shape == (7,) and np.abs(action).max() <= 1
         self.position = self.position + action[:3] * SCALE[:3]
         self.rotation = Rotation.from_rotvec(action[3:6] * SCALE[3:]) * self.rotation
-        self.fingers, self.steps = float(action[6]), self.steps + 1
-        return self._read().set("reward", torch.zeros(1))
+        self.fingers = float(action[6])
+        return super()._step(tensordict)
 
     def _set_seed(self, seed):
         self.start = seed

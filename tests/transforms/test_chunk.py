@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, Ten
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, ends_of
 from warmprior import ActionHistory, ChunkStep
 
 
@@ -168,13 +168,7 @@ class VectorEnv(EnvBase):
         self.state_spec = self.observation_spec.clone()
         self.action_spec = Bounded(-1, 1, (2, *action_shape))
         self.reward_spec = reward_spec
-        self.done_spec = Composite(
-            {
-                key: Categorical(2, dtype=torch.bool, shape=(2, 1))
-                for key in ("done", "terminated", "truncated")
-            },
-            shape=self.batch_size,
-        )
+        self.done_spec = ends_of(2)
 
     def _reset(self, tensordict=None, **kwargs):
         count = torch.zeros(2, 1, dtype=torch.int64)
@@ -219,16 +213,10 @@ def test_an_event_at_any_executed_step_is_one_of_the_chunk(place):
             flag = Categorical(2, dtype=torch.bool, shape=(1,))
             self.observation_spec["success"], self.observation_spec["bell"] = flag, flag.clone()
 
-        def _flags(self, out):
+        def _seen(self, out):
             out["success"] = torch.tensor([self.t in (2, 7)])
             out["bell"] = torch.tensor([self.t == 4])
             return out
-
-        def _reset(self, tensordict=None, **kwargs):
-            return self._flags(super()._reset(tensordict))
-
-        def _step(self, tensordict):
-            return self._flags(super()._step(tensordict))
 
     base = Events() if place == "single" else SerialEnv(2, [partial(Events, n) for n in (7, 4)])
     env = TransformedEnv(base, ChunkStep(3))

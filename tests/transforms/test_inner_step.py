@@ -36,16 +36,10 @@ class SensorsEnv(CountingEnv):
         self.observation_spec["pixels"] = Bounded(0, 255, (2, 4, 3), dtype=torch.uint8)
         self.observation_spec["sensor"] = Unbounded((2,), dtype=torch.float64)
 
-    def _sense(self, out):
+    def _seen(self, out):
         out["pixels"] = torch.full((2, 4, 3), 10 * self.t, dtype=torch.uint8)
         out["sensor"] = torch.full((2,), 1 / (3 + self.t), dtype=torch.float64)
         return out
-
-    def _reset(self, tensordict=None, **kwargs):
-        return self._sense(super()._reset(tensordict))
-
-    def _step(self, tensordict):
-        return self._sense(super()._step(tensordict))
 
 
 CHANGES = {

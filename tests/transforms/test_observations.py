@@ -41,7 +41,7 @@ class CameraEnv(CountingEnv):
             "named": Composite(sensors=Composite(low=Composite(joints=state))),
         }[layout]
 
-    def _arrange(self, out):
+    def _seen(self, out):
         state = out.pop("observation")
         state[1] = 0  # the episode's number
         image = torch.full(IMAGE, 20 * self.t, dtype=torch.uint8)
@@ -50,12 +50,6 @@ class CameraEnv(CountingEnv):
         if self.layout == "nested":
             return out.set("observation", TensorDict({"state": state, "pixels": image}, []))
         return out.set(("sensors", "low", "joints"), state)
-
-    def _reset(self, tensordict=None, **kwargs):
-        return self._arrange(super()._reset(tensordict))
-
-    def _step(self, tensordict):
-        return self._arrange(super()._step(tensordict))
 
 
 NAMES = {

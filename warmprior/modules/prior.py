@@ -101,7 +101,7 @@ class Prior(Registered):
         [[3.0, 3.0, 3.0, 3.0], [1.0, 1.0, 1.0, 1.0]]
     """
 
-    prediction_chunks: ClassVar[int] = 1
+    prediction_chunks: int = 1
     """Predicted actions ``P`` per executed ones ``H``."""
     default_sigma: ClassVar[float] = 1.0
     """``sigma`` where none is given."""
