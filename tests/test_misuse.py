@@ -34,14 +34,6 @@ def steps() -> TensorDict:
     return demonstrations(20, 10, d_a=1)
 
 
-def test_a_vector_environment_of_gymnasium_cannot_execute_chunks():
-    """It would play the rest of a chunk in the next episode."""
-    env = TransformedEnv(GymEnv("Pendulum-v1", num_envs=2), policy_transforms(PRIOR, observation_steps=1))
-    with pytest.raises(RuntimeError, match="SerialEnv or ParallelEnv"):
-        env.rollout(2, actor())
-    env.close()
-
-
 @pytest.mark.parametrize("frame", [-1, 20])
 def test_a_step_that_the_data_do_not_hold(frame):
     windows = window_transforms(steps(), PRIOR, observation_steps=1)

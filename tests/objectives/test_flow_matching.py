@@ -228,3 +228,35 @@ def test_ctrl_c_in_the_network_is_one():
     hook.remove()
     assert loss(data)["loss_flow_matching"].isfinite()
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+@pytest.mark.parametrize("trailing", [(), (1,)])
+def test_weights_and_masks_of_torchrl(reduction, trailing):
+    """``priority_weight`` of prioritised sampling, and ``("collector", "mask")`` of padded trajectories."""
+    actor = actor_for(PastPrior(H))
+    batch = window_replay_buffer(dataset(), actor.prior, batch_size=12).sample().reshape(3, 4)
+
+    def loss(reduction, **options):
+        generator = torch.Generator().manual_seed(5)
+        module = FlowMatchingLoss(actor, reduction=reduction, generator=generator)
+        for name, value in options.items():
+            setattr(module, name, value)
+        return module(batch)["loss_flow_matching"]
+
+    error = loss("none")  # zero where padded
+    counts = (~batch["action_is_pad"]).double()
+    mask, weight = torch.rand(3, 4) < 0.6, torch.rand(3, 4)
+    batch["collector", "mask"] = mask.reshape(3, 4, *trailing)
+    for weighted in (False, True):
+        if weighted:
+            batch["priority_weight"] = weight.reshape(3, 4, *trailing)
+        w = counts * mask.unsqueeze(-1) * (weight.unsqueeze(-1) if weighted else 1)
+        expected = error * w.unsqueeze(-1)
+        if reduction != "none":
+            expected = expected.sum() / (w.sum() * D_A if reduction == "mean" else 1)
+        torch.testing.assert_close(loss(reduction).detach(), expected.detach().float())
+    plain = loss("none", loss_mask_key=None, use_prioritized_weights=False)
+    torch.testing.assert_close(plain, error)
+    batch["collector", "mask"] = torch.zeros(3, 4, dtype=torch.bool)
+    assert not loss("mean")  # nothing counts: 0, and not NaN

@@ -160,7 +160,7 @@ def test_the_last_actions_are_appended_to_the_vector_among_several(place):
     env.close()
 
 
-@pytest.mark.parametrize(("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.int64)])
+@pytest.mark.parametrize(("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.complex64)])
 def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
     actions = torch.zeros(shape, dtype=dtype)
     data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])

@@ -108,8 +108,10 @@ class Normalizer(nn.Module):
         """Raw to normalised, for the keys that are present; a shallow copy."""
         data = data.clone(False)
         for key in self.keys:
-            if data.get(key, None) is not None:
-                data.set(key, (data.get(key) - self.loc(key)) / self.scale(key))
+            value, loc = data.get(key, None), self.loc(key)
+            if value is not None:
+                value = value if value.is_floating_point() else value.to(loc.dtype)
+                data.set(key, (value - loc) / self.scale(key))
         return data
 
     def denormalize(self, data: TensorDictBase) -> TensorDictBase:
@@ -120,7 +122,7 @@ class Normalizer(nn.Module):
                 data.set(key, data.get(key) * self.scale(key) + self.loc(key))
         return data
 
-    def env_transforms(self) -> list[Transform]:
+    def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
         """TorchRL transforms that (de)normalise next to the base environment.
 
         Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step.
@@ -128,7 +130,7 @@ class Normalizer(nn.Module):
         transforms: list[Transform] = []
         for key in self.keys:
             loc, scale = self.loc(key).clone(), self.scale(key).clone()
-            if key == keys.ACTION:
+            if key == action_key:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
                 transforms.append(ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))

@@ -54,15 +54,17 @@ class FlowMatchingLoss(LossModule):
             deviation :math:`s`, errors at ``t = 0``, where one-step samplers are, count :math:`s^2` times
             those at ``t = 1``.
         interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or the line.
-        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number), ``"sum"``
-            (Algorithm 1's) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
+        reduction: ``"mean"`` over coordinates that count (Algorithm 1 divided by their number, or by the sum
+            of their weights), ``"sum"`` (Algorithm 1's) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
 
     .. note::
         Keys read (renameable by :meth:`set_keys`; those of :class:`~warmprior.ActionWindow`, whatever keys of
         its own the policy has): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool ``[*B, P]``
-        (optional), the ``history`` (:mod:`warmprior.history`) and ``observation`` ``[*B, To, d_o]``. Batches
-        are moved to the network's device, where the generator has to be.
+        (optional), the ``history`` (:mod:`warmprior.history`) and ``observation`` ``[*B, To, d_o]``; where
+        they are there, TorchRL's ``priority_weight`` ``[*B]`` and the masks of its ``loss_mask_key``, such as
+        ``("collector", "mask")`` of padded trajectories. Batches are moved to the network's device, where the
+        generator has to be.
 
     Raises:
         ValueError: for an unknown option, or options that do not fit each other, the network or the policy.
@@ -93,6 +95,7 @@ class FlowMatchingLoss(LossModule):
         pad_mask: NestedKey = keys.IS_PAD
         history: NestedKey = keys.HISTORY
         observation: NestedKey = keys.OBSERVATION
+        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -150,18 +153,21 @@ class FlowMatchingLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss of a batch of windows; a ``KeyError`` if a needed key is missing."""
-        a0, a1, observation, pad = self.ends(tensordict)
+        a0, a1, observation, weight = self.ends(tensordict)
         t = self.times(a1.shape[:-2], self.generator, a1.dtype, a1.device)
         a_t, velocity = self.interpolant(a0, a1, t, self.generator)
         field = velocity_field(self.actor_network.network, observation)
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
-        loss = self.reduced(self.error(predicted, velocity, t), pad)
+        loss = self.reduced(self.error(predicted, velocity, t), weight)
         return TensorDict({self.out_keys[0]: loss}, batch_size=[])
 
     def ends(
         self, tensordict: TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor | TensorDictBase, Tensor | None]:
-        """Return the ends of the paths, ``[*B, P, d_a]``, flat observations, and where windows are padded."""
+        """Return the ends of the paths, ``[*B, P, d_a]``, flat observations, and how much positions count.
+
+        Weights are ``[*B, P]``, or ``None`` where all count alike.
+        """
         k, actor = self.tensor_keys, self.actor_network
         needed = (k.chunk, k.history, k.observation)
         check_keys(tensordict, needed, type(self).__name__, ". Take batches of window_replay_buffer")
@@ -171,9 +177,19 @@ class FlowMatchingLoss(LossModule):
         a0 = actor.prior.sample(history, observation, self.generator)
         if self.coupling is not None:
             a0, a1 = self.coupling(a0, a1, observation)
-        pad = tensordict.get(k.pad_mask, None)
         observation = network_observation(observation, a1.shape[:-2])
-        return a0, a1, observation, None if pad is None else pad.to(device)
+        return a0, a1, observation, self._weight(tensordict, a1)
+
+    def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> Tensor | None:
+        pad, weight = tensordict.get(self.tensor_keys.pad_mask, None), None
+        factors = [None if pad is None else ~pad, self._maybe_get_priority_weight(tensordict)]
+        factors += [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        for factor in factors:
+            if factor is not None:
+                # Of windows `[*B]` or `[*B, 1]`, or of positions `[*B, P]`.
+                factor = factor.to(a1).reshape(*factor.shape, *(1,) * (a1.ndim - 1 - factor.ndim))
+                weight = factor if weight is None else weight * factor
+        return None if weight is None else weight.expand(a1.shape[:-1])
 
     def error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
         """Return the objective's error of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
@@ -183,13 +199,14 @@ class FlowMatchingLoss(LossModule):
             error = error / unit.view_as(error)
         return (1 - t)[..., None, None] * error.abs() if self.objective == "l1" else error.square()
 
-    def reduced(self, error: Tensor, pad: Tensor | None) -> Tensor:
-        """Reduce errors ``[*B, P, d_a]`` where they count."""
+    def reduced(self, error: Tensor, weight: Tensor | None) -> Tensor:
+        """Reduce errors ``[*B, P, d_a]`` with weights ``[*B, P]``."""
         count: Tensor | int = max(1, error.numel())
-        if pad is not None:
-            error = error.masked_fill(pad.unsqueeze(-1), 0.0)
-            # At least 1, so that padding alone gives 0 and not NaN.
-            count = ((~pad).sum() * error.shape[-1]).clamp_min(1)
+        if weight is not None:
+            # What does not count may be NaN. Where nothing does, the mean is 0.
+            error = torch.where(weight.unsqueeze(-1) == 0, 0.0, error * weight.unsqueeze(-1))
+            total = weight.sum() * error.shape[-1]
+            count = torch.where(total > 0, total, 1.0)
         if self.reduction == "none":
             return error
         return error.sum() / count if self.reduction == "mean" else error.sum()

@@ -74,7 +74,7 @@ class SelfDistillationLoss(FlowMatchingLoss):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss of a batch of windows; a ``KeyError`` if a needed key is missing."""
-        a0, a1, observation, pad = self.ends(tensordict)
+        a0, a1, observation, weight = self.ends(tensordict)
         n = max(1, round(SHARE * a1.shape[:-2].numel()))
         a0, a1 = (end.detach().reshape(-1, *end.shape[-2:])[:n] for end in (a0, a1))
         observation, network = observation[:n], self.actor_network.network
@@ -88,5 +88,5 @@ class SelfDistillationLoss(FlowMatchingLoss):
             end = integrate(field, point, nfe=TEACHER_STEPS - 1, start_time=near)
         jump = velocity_field(network, observation)(t, start)
         error = self.error(jump, (end - start) / (1.0 - begin), t)
-        loss = self.reduced(error, None if pad is None else pad.reshape(-1, pad.shape[-1])[:n])
+        loss = self.reduced(error, None if weight is None else weight.reshape(-1, weight.shape[-1])[:n])
         return TensorDict({self.out_keys[0]: loss}, batch_size=[])

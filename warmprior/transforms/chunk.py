@@ -13,10 +13,10 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import (
     ActionScaling,
+    ConditionalSkip,
     ObservationNorm,
     Transform,
     TransformedEnv,
-    VecGymEnvTransform,
 )
 
 from warmprior import keys
@@ -198,8 +198,9 @@ class ChunkStep(EnvTransform):
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
             or keys are not as many.
         KeyError: (in an environment) if there is no such action, or another one that nobody would choose.
-        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, or is
-            a vector environment of Gymnasium.
+        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, skips
+            single steps, or restarts rows by itself so that the rest of a chunk would be played in the next
+            episode.
 
     Examples:
         >>> from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
@@ -250,8 +251,12 @@ class ChunkStep(EnvTransform):
         chunks = self._chunks(tensordict)
         # Inverse transforms of the environment below may change it before _step gets it.
         self._input = tensordict.copy()
-        if "_step" in tensordict:
+        rows = tensordict.get("_step", None)
+        if rows is not None:
             set_aside(tensordict, self._inner_step()[0].observed)
+            if not rows.any():  # TorchRL skips the decision, and copies what it finds
+                self._input = None
+                tensordict.set(keys.EXECUTED, torch.zeros_like(tensordict.get(keys.EXECUTED)))
         for key, chunk in chunks.items():
             tensordict.set(key, chunk[..., 0, :])
         return tensordict
@@ -286,11 +291,11 @@ class ChunkStep(EnvTransform):
                     "return: have the environment write it under another key as well"
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
-            if self.execute > 1 and any(isinstance(t, VecGymEnvTransform) for t in inner.transforms):
+            inner.restarts.check(self.execute)
+            if any(isinstance(t, ConditionalSkip) for t in inner.transforms):
                 raise RuntimeError(
-                    "ChunkStep cannot step a vector environment of Gymnasium (num_envs): it restarts an "
-                    "episode that ends inside a chunk, and the rest of the chunk would be played in the next "
-                    "one. Use SerialEnv or ParallelEnv of single environments"
+                    "ChunkStep cannot skip single steps of a chunk: append ConditionalSkip after it, where "
+                    "it skips decisions"
                 )
             late = LateTransforms.of(inner, read, self.in_keys_inv)
             self._inner = (parent, inner, late, rewards[0])
@@ -303,6 +308,9 @@ class ChunkStep(EnvTransform):
         if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
         chunks = self._chunks(before)
+        next_tensordict = (
+            next_tensordict.clone()
+        )  # an environment may write the next one into the same memory
         # A plain dictionary: a tensordict's checks would be made at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
@@ -332,14 +340,16 @@ class ChunkStep(EnvTransform):
             inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
             for key, chunk in chunks.items():
                 inputs.set(key, chunk[..., i, :])
-            result = step(inputs, alive)
+            result = step(inputs, alive, last=i == self.execute - 1)
             reward = result.get(reward_key)
             if alive is None:
                 next_tensordict = result
                 steps += 1
             else:
                 reward = torch.where(expand_as_right(alive, reward), reward, 0)
-                next_tensordict = rows_where(alive, result, next_tensordict)
+                # Rows that a simulator has restarted show where it is now: in the end, a fresh reset.
+                but = self._shown() if step.restarts.native else ()
+                next_tensordict = rows_where(alive, result, next_tensordict, but)
                 steps += alive
             earned.append(reward)
             ran.append(alive)
@@ -361,7 +371,13 @@ class ChunkStep(EnvTransform):
             ]
             next_tensordict.set(key, torch.stack(counted).sum(0))
         next_tensordict.set(reward_key, self._return(earned))
-        return next_tensordict.set(keys.EXECUTED, steps.unsqueeze(-1))
+        next_tensordict.set(keys.EXECUTED, steps.unsqueeze(-1))
+        self._remember_ends(next_tensordict, [keys.EXECUTED, self.success, *self.measures])
+        return next_tensordict
+
+    def _shown(self) -> set[NestedKey]:
+        """The observations that are of one moment, and not of a chunk."""
+        return {*self.parent.observation_spec.keys(True, True)} - {self.success, *self.measures}
 
     def _return(self, rewards: list[Tensor]) -> Tensor:
         """The discounted sum, accumulated in floating point."""

@@ -80,7 +80,9 @@ class ActionHistory(EnvTransform):
         moved = advance(history, tensordict.get(self.in_keys[0]), executed)
         next_tensordict.set(self.history_key, moved)
         # The others' chunks were not executed.
-        return keep_resting(tensordict, next_tensordict, self.out_keys)
+        next_tensordict = keep_resting(tensordict, next_tensordict, self.out_keys)
+        self._remember_ends(next_tensordict, [self.history_key])
+        return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 import torch
@@ -11,6 +11,8 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
+
+from warmprior.transforms.restarts import NATIVE, Restarts
 
 KEPT = "_kept"
 """Where :func:`set_aside` puts observations, at the root of a step's input."""
@@ -26,6 +28,8 @@ def check_unwritten(observation_spec: Any, names: Iterable[NestedKey], whose: st
 class EnvTransform(Transform):
     """A transform that writes the same after a reset as after a step, and nothing outside environments."""
 
+    _ends: TensorDictBase | None = None
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Does nothing: what the transform writes is already in data, or not needed there."""
         return tensordict
@@ -33,6 +37,27 @@ class EnvTransform(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # For all sub-environments: TorchRL keeps the rows of those that were reset.
         return self._call(tensordict_reset)
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """Begin the new episode of rows that the simulator has restarted; TorchRL merges nothing here."""
+        rows = tensordict.get("_reset").view(tensordict.batch_size)
+        fresh = self._reset(tensordict, tensordict_reset.copy())
+        return rows_where(rows, fresh, tensordict_reset)
+
+    def _remember_ends(self, next_tensordict: TensorDictBase, names: Iterable[NestedKey]) -> None:
+        """Remember what was written: with native autoresets TorchRL blanks all observations of an end."""
+        if self.parent.__dict__.get(NATIVE, False):
+            self._ends = next_tensordict.select(*names, strict=False).copy()
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._ends is not None:
+            tensordict.get("next").update(self._ends)
+            self._ends = None
+        return tensordict, tensordict_
 
 
 class InnerStep:
@@ -56,6 +81,7 @@ class InnerStep:
             )
         self.base: EnvBase = container.base_env
         self.transforms = before
+        self.restarts = Restarts(container, before)
         states = set(self.base.state_spec.keys(True, True))
         self.observed = [key for key in self.base.observation_spec.keys(True, True) if key not in states]
         done_spec = self.base.full_done_spec
@@ -64,8 +90,15 @@ class InnerStep:
         inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
-    def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """Take the step of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined."""
+    def __call__(
+        self, tensordict: TensorDictBase, rows: Tensor | None = None, last: bool = False
+    ) -> TensorDictBase:
+        """Take the step of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined.
+
+        After the ``last`` step of a decision, rows that a simulator has restarted show a fresh reset.
+        """
+        if rows is not None and self.restarts.needed:
+            self.restarts.rows(tensordict.get("done").view_as(rows))
         for branch in self._branches:
             if branch in tensordict:
                 tensordict.set(branch, tensordict.get(branch).copy())
@@ -75,13 +108,19 @@ class InnerStep:
         for transform in reversed(self.transforms):
             tensordict = transform._inv_call(tensordict)
         result = self.bare(tensordict)
+        if rows is not None and self.restarts.native:
+            done, ended = (place.get("done").view_as(rows) for place in (result, tensordict))
+            if last or not (rows & ~done).any():
+                fresh = self.restarts.rows(ended).select(*self.observed, strict=False)
+                result = rows_where(ended, result.copy().update(fresh), result)
         for transform in self.transforms:
             result = transform._step(tensordict, result)
         return result
 
     def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The result of a step ``[*B]`` of the environment itself, with all its flags."""
-        result = self.base._step(tensordict)
+        # Cloned, because an environment may write the next one into the same memory.
+        result = self.base._step(tensordict).clone()
         found = dict(result.items())  # several times faster to ask
         for key, shape in self._done_shapes:
             done = found.get(key) if isinstance(key, str) else result.get(key, None)
@@ -98,7 +137,9 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
     For the rows that it leaves out it returns what it finds in the step's input, and fails, or casts
     silently, if a transform gave that another shape or dtype.
     """
-    kept = tensordict.get(KEPT, None)
+    rows, kept = tensordict.get("_step", None), tensordict.get(KEPT, None)
+    if rows is None or not rows.any():
+        return  # all step, or none: then TorchRL copies what it finds
     if kept is None:
         kept = tensordict.empty()
         tensordict.set(KEPT, kept)
@@ -122,11 +163,16 @@ def keep_resting(
     return next_tensordict
 
 
-def rows_where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
-    """``new``, but with the rows of ``old`` where ``mask`` ``[*B]`` does not hold and ``old`` has the key."""
+def rows_where(
+    mask: Tensor, new: TensorDictBase, old: TensorDictBase, but: Container[NestedKey] = ()
+) -> TensorDictBase:
+    """``new``, with the rows of ``old`` where ``mask`` ``[*B]`` does not hold and ``old`` has the key.
+
+    Entries ``but`` some, which stay those of ``new``.
+    """
     result = new.copy()
     for key in new.keys(True, True):
-        previous = old.get(key, None)
+        previous = None if key in but else old.get(key, None)
         if previous is not None:
             value = new.get(key)
             result.set(key, torch.where(expand_as_right(mask, value), value, previous))

@@ -104,7 +104,7 @@ def policy_transforms(
         check_delay(delay, execute, prior.prediction_length)
         late.append(InferenceDelay(delay, execute=execute, chunk_key=chunk_key, history_key=history_key))
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
-    per_step += [] if normalizer is None else normalizer.env_transforms()
+    per_step += [] if normalizer is None else normalizer.env_transforms(action_key)
     return Compose(
         *per_step,
         ObservationStack(observation_steps, observation_key=observation_key),

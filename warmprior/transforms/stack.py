@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers
-from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
+from warmprior.transforms.inner_step import KEPT, EnvTransform, rows_where, set_aside
 
 
 class ObservationStack(EnvTransform):
@@ -48,8 +48,7 @@ class ObservationStack(EnvTransform):
         self.observation_key = unravel_key(observation_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if "_step" in tensordict:
-            set_aside(tensordict, [self.observation_key])
+        set_aside(tensordict, [self.observation_key])
         return tensordict
 
     def _stack(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
@@ -89,6 +88,16 @@ class ObservationStack(EnvTransform):
             tensordict_reset.get(self.observation_key),
         )
         return tensordict_reset.set(self.observation_key, stack)
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # The step has appended the new episode's first observation to the stack of the old one.
+        time = self._time(tensordict_reset)
+        newest = _each(lambda stack: stack.select(time, -1), tensordict_reset.get(self.observation_key))
+        first = tensordict_reset.copy().set(self.observation_key, newest)
+        rows = tensordict.get("_reset").view(tensordict.batch_size)
+        return rows_where(rows, self._reset(tensordict, first), tensordict_reset)
 
     def _time(self, place: TensorDictBase | Composite) -> int:
         """Return the stack's dimension: behind those of the batch, and of a group's agents."""

@@ -141,11 +141,13 @@ def _checked(
     observation, action, episode = entries
     if data.ndim != 1 or not len(data):
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
-    if action.ndim != 2 or not action.is_floating_point():
+    if action.ndim != 2 or action.is_complex():
         raise ValueError(
             f"actions must be vectors of real numbers, {keys.ACTION!r} [N, d_a], got {tuple(action.shape)} "
-            f"of {action.dtype}: flatten it, or convert it with .float()"
+            f"of {action.dtype}: flatten it"
         )
+    if not action.is_floating_point():
+        action = action.to(torch.get_default_dtype())
     observations = {observation_key: observation}
     if is_tensor_collection(observation):
         nested = observation.items(True, True)

@@ -1,0 +1,151 @@
+"""What other people's environments do: their own buffers, whole-number actions, skipped steps."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.data import MultiCategorical, OneHot, Unbounded
+from torchrl.envs import Compose, ConditionalSkip, SerialEnv, StepCounter, TransformedEnv
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, demonstrations
+from warmprior import (
+    ActionHistory,
+    ChunkStep,
+    Normalizer,
+    ObservationStack,
+    PastPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    keys,
+    policy_transforms,
+    window_replay_buffer,
+)
+
+H = 4
+PRIOR = PastPrior(H)
+
+
+def chosen(tensordict):
+    """Chunks that tell the last observation."""
+    seen = tensordict["observation"][..., -1:, :ACTION_DIM]
+    return seen / 10 + torch.arange(H)[:, None]
+
+
+POLICY = ChunkPolicy(chosen)
+
+
+class OwnBuffers(CountingEnv):
+    """Writes every observation, reward and flag into the same memory, as some simulators do."""
+
+    buffers = None
+
+    def _seen(self, out):
+        self.buffers = self.buffers or {}
+        for key, value in out.items():
+            buffer = self.buffers.setdefault(key, torch.empty_like(value))
+            out.set(key, buffer.copy_(value))
+        return out
+
+
+@pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("execute", [1, 2, H])
+def test_an_environment_may_overwrite_what_it_returned(execute, counted):
+    def played(env):
+        first = [StepCounter()] if counted else []
+        env = TransformedEnv(env, Compose(*first, *policy_transforms(PRIOR, execute=execute)))
+        data, decisions = env.reset(), []
+        for _ in range(4):
+            data, after = env.step_and_maybe_reset(POLICY(data))
+            decisions.append(data.clone())  # TorchRL keeps references
+            data = after
+        return torch.stack(decisions)
+
+    found, expected = played(OwnBuffers(7)), played(CountingEnv(7))
+    for key in expected.keys(True, True):
+        torch.testing.assert_close(found[key], expected[key], msg=str(key))
+
+
+def integers(spec):
+    env = CountingEnv(7)
+    env.action_spec = spec
+    return env
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.float64])
+def test_a_history_is_real_whatever_the_actions_are(dtype):
+    spec = {
+        torch.int64: MultiCategorical([5] * ACTION_DIM),
+        torch.bool: OneHot(ACTION_DIM),
+        torch.float64: Unbounded((ACTION_DIM,), dtype=torch.float64),
+    }[dtype]
+    expected = torch.float64 if dtype == torch.float64 else torch.float32
+    env = TransformedEnv(integers(spec), policy_transforms(PRIOR))
+    data = env.reset()
+    chunk = torch.full((H, ACTION_DIM), -3.31)
+    after = env.step(data.set(keys.CHUNK, chunk))["next"]
+    for place in (data, after):
+        assert place["history", "actions"].dtype == place["history", "forecast"].dtype == expected
+    torch.testing.assert_close(after["history", "actions"].float(), chunk)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.uint8])
+def test_windows_and_policies_of_whole_numbers(dtype):
+    data = demonstrations(40, 10, d_a=2)
+    data["action"] = (data["action"] > data["action"].mean()).to(dtype)
+    scaler = Normalizer.fit(data)
+    windows = window_replay_buffer(scaler.normalize(data), PRIOR, batch_size=8, observation_steps=1)
+    plain = window_replay_buffer(data, PRIOR, batch_size=8, observation_steps=1)
+    for buffer, values in ((windows, [-1.0, 1.0]), (plain, [0.0, 1.0])):
+        batch = buffer.sample()
+        for key in (keys.CHUNK, ("history", "actions")):
+            assert batch[key].dtype == torch.float32
+        assert set(batch[keys.CHUNK].unique().tolist()) <= set(values)
+    width = data["observation"].shape[-1]
+    actor = WarmPriorActor(VelocityMLP(2, width, H, 1), PRIOR, normalizer=scaler)
+    assert actor(windows.sample())[keys.CHUNK].dtype == torch.float32
+
+
+def every_second(tensordict):
+    """Skip where the last decision executed something."""
+    return tensordict[keys.EXECUTED] > 0
+
+
+@pytest.mark.parametrize("rows", [(), (9, 30)])
+def test_a_skipped_decision_changes_nothing(rows):
+    base = SerialEnv(2, [partial(CountingEnv, n) for n in rows]) if rows else CountingEnv(30)
+    env = TransformedEnv(base, Compose(*policy_transforms(PRIOR), ConditionalSkip(every_second)))
+    data = env.reset()
+    for i in range(4):
+        before = data.clone()
+        step = env.step(POLICY(data))
+        after, data = step["next"], env.step_mdp(step)
+        if i % 2:
+            assert not after[keys.EXECUTED].any() and not after["reward"].any()
+            for key in ("observation", *(("history", name) for name in ("actions", "steps", "forecast"))):
+                torch.testing.assert_close(after[key], before[key], msg=str(key))
+        else:
+            assert (after[keys.EXECUTED] == H).all()
+
+
+def test_a_row_may_skip_its_decision():
+    def second_row(tensordict):
+        return torch.tensor([[False], [True]])
+
+    base = SerialEnv(2, [partial(CountingEnv, 9)] * 2)
+    env = TransformedEnv(base, Compose(*policy_transforms(PRIOR), ConditionalSkip(second_row)))
+    data = env.reset()
+    after = env.step(POLICY(data))["next"]
+    assert after[keys.EXECUTED].flatten().tolist() == [H, 0]
+    assert after["reward"].flatten().tolist() == [10.0, 0.0]
+    torch.testing.assert_close(after["observation"][1], data["observation"][1])
+    assert not after["history", "steps"][1].any()
+
+
+def test_single_steps_are_not_skipped():
+    skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
+    transforms = Compose(ObservationStack(1), skip, ChunkStep(H), ActionHistory(H))
+    env = TransformedEnv(CountingEnv(9), transforms)
+    with pytest.raises(RuntimeError, match="ConditionalSkip after"):
+        env.rollout(2, POLICY)
