@@ -18,7 +18,6 @@ class Field(nn.Module):
     def __init__(self, function):
         super().__init__()
         self.function = function
-        self.anchor = nn.Parameter(torch.zeros(()))  # gives the policy a device
 
     def forward(self, t, a, observation):
         return self.function(t.view(-1, 1, 1), a, observation)

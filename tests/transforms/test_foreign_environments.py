@@ -6,8 +6,18 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.data import MultiCategorical, OneHot, Unbounded
-from torchrl.envs import Compose, ConditionalSkip, SerialEnv, StepCounter, TransformedEnv
+from tensordict import NonTensorData, TensorDict
+from torchrl.data import Categorical, Composite, MultiCategorical, NonTensor, OneHot, Unbounded
+from torchrl.envs import (
+    ActionDiscretizer,
+    Compose,
+    ConditionalSkip,
+    GymEnv,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, demonstrations
 from warmprior import (
@@ -21,6 +31,7 @@ from warmprior import (
     keys,
     policy_transforms,
     window_replay_buffer,
+    window_transforms,
 )
 
 H = 4
@@ -147,5 +158,112 @@ def test_single_steps_are_not_skipped():
     skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
     transforms = Compose(ObservationStack(1), skip, ChunkStep(H), ActionHistory(H))
     env = TransformedEnv(CountingEnv(9), transforms)
-    with pytest.raises(RuntimeError, match="ConditionalSkip after"):
+    with pytest.raises(RuntimeError, match="ConditionalSkip"):
         env.rollout(2, POLICY)
+
+
+class Told(CountingEnv):
+    """Says what to do in words, beside the observation."""
+
+    def __init__(self, length):
+        super().__init__(length)
+        self.observation_spec["instruction"] = NonTensor(shape=())
+
+    def _seen(self, out):
+        return out.set("instruction", NonTensorData(f"step {self.t} of {self.length}"))
+
+
+def told(base):
+    env = TransformedEnv(base, policy_transforms(PRIOR))
+    data, heard = env.reset(), []
+    for _ in range(3):
+        step, data = env.step_and_maybe_reset(POLICY(data))
+        words = (place["instruction"] for place in (step, step["next"]))
+        heard.append([[w] if isinstance(w, str) else list(w) for w in words])
+    return heard
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+def test_language_beside_the_observation(kind):
+    lengths = (9, 6)
+    env = kind(2, [partial(Told, n) for n in lengths])
+    found, alone = told(env), [told(Told(n)) for n in lengths]
+    assert found == [[[*a, *b] for a, b in zip(*step, strict=True)] for step in zip(*alone, strict=True)]
+    assert found[1][1] == ["step 8 of 9", "step 6 of 6"]  # the second row rested for two steps
+    env.close()
+
+
+class Points(CountingEnv):
+    """As many points as steps."""
+
+    def __init__(self, length):
+        super().__init__(length)
+        self.observation_spec["points"] = Unbounded((length, 3))
+
+    def _seen(self, out):
+        return out.set("points", torch.full((self.length, 3), float(self.t)))
+
+
+def test_observations_of_other_shapes_in_other_rows():
+    lengths = (9, 6)
+    inside = [lambda n=n: TransformedEnv(Points(n), policy_transforms(PRIOR)) for n in lengths]
+    env = SerialEnv(2, inside)
+    after = env.step(POLICY(env.reset()))["next"]
+    assert [row["points"].unique().tolist() for row in after.unbind(0)] == [[4.0], [4.0]]
+    env = TransformedEnv(SerialEnv(2, [partial(Points, n) for n in lengths]), policy_transforms(PRIOR))
+    with pytest.raises(RuntimeError, match=r"\['points'\].*inside"):
+        env.step(POLICY(env.reset()))
+
+
+class PerAgent(CountingEnv):
+    """Ends of three agents, at the root."""
+
+    def __init__(self):
+        super().__init__(9)
+        flags = {
+            n: Categorical(2, dtype=torch.bool, shape=(3, 1)) for n in ("done", "terminated", "truncated")
+        }
+        self.done_spec = Composite(flags)
+
+    def _seen(self, out):
+        return out.update({key: out[key].expand(3, 1).clone() for key in self.done_keys})
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (PerAgent, r"\[1\].*\[3, 1\]"),
+        (
+            lambda: TransformedEnv(GymEnv("Pendulum-v1"), ActionDiscretizer(num_intervals=5)),
+            "ActionDiscretizer",
+        ),
+    ],
+)
+def test_environments_that_chunks_do_not_fit(make, said):
+    base = make()
+    env = TransformedEnv(base, policy_transforms(PRIOR))
+    with pytest.raises(RuntimeError, match=said):
+        env.rollout(2, ChunkPolicy(lambda data: torch.zeros(H, env.full_action_spec[keys.CHUNK].shape[-1])))
+
+
+def test_a_number_is_no_observation():
+    data = demonstrations().set("observation", torch.zeros(60))
+    with pytest.raises(ValueError, match=r"'observation'.*unsqueeze"):
+        window_replay_buffer(data, PRIOR, batch_size=4)
+    with pytest.raises(ValueError, match=r"'frame'.*float32"):
+        window_transforms(demonstrations(), PRIOR)(TensorDict({"frame": torch.zeros(2)}, [2]))
+    env = CountingEnv(9)
+    env.observation_spec = Composite(observation=Unbounded(()))
+    with pytest.raises(ValueError, match=r"'observation'.*UnsqueezeTransform"):
+        _ = TransformedEnv(env, policy_transforms(PRIOR)).observation_spec
+
+
+@pytest.mark.slow
+def test_a_step_compiles_from_cold():
+    env = TransformedEnv(CountingEnv(9), policy_transforms(PRIOR))
+    step = torch.compile(env.step_and_maybe_reset, backend="eager")
+    data, executed = env.reset(), []
+    for _ in range(4):
+        done, data = step(POLICY(data))
+        executed.append(int(done["next", keys.EXECUTED]))
+    assert executed == [H, H, 1, H]

@@ -23,7 +23,7 @@ from warmprior.checks import (
 )
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
-from warmprior.modules.network import encoded
+from warmprior.modules.network import device_of, encoded
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_transforms
@@ -67,7 +67,7 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
     check_usual_keys(policy, "a measure")
     if isinstance(batch.get(observation_key), TensorDictBase):
         raise ValueError(f"{observation_key!r} is not a vector: pass encoded_windows(policy, windows)")
-    device = next(policy.parameters()).device
+    device = device_of(policy, batch.get(observation_key))
     prior, ndim = policy.prior, batch.ndim
 
     def flat(key: NestedKey) -> Tensor | None:
@@ -150,7 +150,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
     if not isinstance(observation, TensorDictBase):
         return windows
     check_not_empty(windows)
-    device = next(policy.parameters()).device
+    device = device_of(policy, observation)
     with evaluation_mode(policy):
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
     features = torch.cat(parts)  # type: ignore[arg-type]

@@ -136,6 +136,11 @@ def _precision(network: nn.Module) -> torch.dtype | None:
     return next((value.dtype for value in values if value.is_floating_point()), None)
 
 
+def device_of(network: nn.Module, data: Tensor | TensorDictBase) -> torch.device:
+    """Where a network's inputs have to be; where ``data`` are if it has no parameters."""
+    return next((p.device for p in network.parameters()), data.device or torch.device("cpu"))
+
+
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
     """An observation, ``[*B, To, *]`` or a tensordict ``[*B]``, with one batch dimension for ``*B``."""
     if len(batch) == 1:

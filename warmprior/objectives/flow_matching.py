@@ -16,7 +16,7 @@ from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positions
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
-from warmprior.modules.network import network_observation, velocity_field
+from warmprior.modules.network import device_of, network_observation, velocity_field
 from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.times import Times, chosen_times
 
@@ -171,7 +171,7 @@ class FlowMatchingLoss(LossModule):
         k, actor = self.tensor_keys, self.actor_network
         needed = (k.chunk, k.history, k.observation)
         check_keys(tensordict, needed, type(self).__name__, ". Take batches of window_replay_buffer")
-        device = next(actor.network.parameters(), tensordict.get(k.chunk)).device
+        device = device_of(actor.network, tensordict.get(k.chunk))
         a1, history, observation = (tensordict.get(key).to(device) for key in needed)
         check_positions(k.chunk, a1, actor.prior)
         a0 = actor.prior.sample(history, observation, self.generator)

@@ -18,6 +18,7 @@ from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import device_of
 from warmprior.objectives.couplings import Coupling
 from warmprior.training.checkpoint import (
     check_identity,
@@ -114,7 +115,7 @@ class BehaviourCloning:
         self.logger = logger
         self.rank = rank()
         home = data.device or torch.device("cpu")
-        device = next((p.device for p in actor.network.parameters()), home)
+        device = device_of(actor.network, data)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         windows = self.generator
         prefetch = prefetch or home.type != device.type

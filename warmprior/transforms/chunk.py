@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_non_tensor, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import (
+    ActionDiscretizer,
     ActionScaling,
     ConditionalSkip,
     ObservationNorm,
@@ -34,6 +35,11 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
     ObservationStack: lambda transform: transform.steps,
 }
 """Transforms without memory, by type: how many of the last observations their output depends on."""
+
+_REFUSED: dict[type[Transform], str] = {
+    ActionDiscretizer: "whose actions are indices, and those of chunks numbers: leave it out",
+    ConditionalSkip: "which skips single steps of a chunk: append it after, where it skips decisions",
+}
 
 
 class LateTransforms:
@@ -142,7 +148,12 @@ def update_input(current: dict[str, Any], next_tensordict: TensorDictBase, rewar
     """A lean ``step_mdp``, in place and without the reward: it runs at every control step."""
     for key, value in next_tensordict.items():
         # The type first: nearly all are plain tensors, and the instance check is slow.
-        if type(value) is not Tensor and isinstance(value, TensorDictBase) and key in current:
+        if (
+            type(value) is not Tensor
+            and is_tensor_collection(value)
+            and not is_non_tensor(value)
+            and key in current
+        ):
             value = current[key].copy().update(value)
         if key != reward_key:
             current[key] = value
@@ -248,12 +259,12 @@ class ChunkStep(EnvTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
-        chunks = self._chunks(tensordict)
+        inner, chunks = self._inner_step()[0], self._chunks(tensordict)
         # Inverse transforms of the environment below may change it before _step gets it.
         self._input = tensordict.copy()
         rows = tensordict.get("_step", None)
         if rows is not None:
-            set_aside(tensordict, self._inner_step()[0].observed)
+            set_aside(tensordict, inner.observed)
             if not rows.any():  # TorchRL skips the decision, and copies what it finds
                 self._input = None
                 tensordict.set(keys.EXECUTED, torch.zeros_like(tensordict.get(keys.EXECUTED)))
@@ -292,14 +303,30 @@ class ChunkStep(EnvTransform):
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
-            if any(isinstance(t, ConditionalSkip) for t in inner.transforms):
-                raise RuntimeError(
-                    "ChunkStep cannot skip single steps of a chunk: append ConditionalSkip after it, where "
-                    "it skips decisions"
-                )
+            for transform in inner.transforms:
+                if why := _REFUSED.get(type(transform)):
+                    raise RuntimeError(f"ChunkStep cannot come after {type(transform).__name__}, {why}")
+            self._check_shapes(inner.base, parent)
             late = LateTransforms.of(inner, read, self.in_keys_inv)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
+
+    def _check_shapes(self, base: EnvBase, parent: EnvBase) -> None:
+        """Refuse ends that are not of rows, and observations that differ between rows."""
+        done, batch = parent.full_done_spec["done"].shape, parent.batch_size
+        if tuple(done) != (*batch, 1):
+            raise RuntimeError(
+                f"ChunkStep needs an end per row, 'done' of shape {[*batch, 1]}, and the environment has "
+                f"{list(done)}: reduce it, or nest those of agents under a key"
+            )
+        uneven = [
+            k for k, leaf in base.observation_spec.items(True, True) if -1 in getattr(leaf, "shape", ())
+        ]
+        if uneven:
+            raise RuntimeError(
+                f"the observations {uneven} have other shapes in other rows, and ChunkStep merges rows: "
+                "append it to the environments inside of the workers"
+            )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         step, late, reward_key = self._inner_step()
@@ -389,6 +416,7 @@ class ChunkStep(EnvTransform):
         return total
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self._inner_step()  # what does not fit is refused before the first step, and a compiled one finds it
         shape = (*tensordict_reset.batch_size, 1)
         executed = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
         return tensordict_reset.set(keys.EXECUTED, executed)

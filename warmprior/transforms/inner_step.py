@@ -6,7 +6,7 @@ from collections.abc import Container, Iterable
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_leaf_nontensor, is_non_tensor
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -145,7 +145,7 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
         tensordict.set(KEPT, kept)
     for key in observed:
         value = tensordict.get(key, None)
-        if value is not None:
+        if value is not None and not is_non_tensor(value):
             # Entries nested under the key may have been set aside before.
             kept.update(tensordict.select(key))
             tensordict.del_(key)
@@ -171,11 +171,12 @@ def rows_where(
     Entries ``but`` some, which stay those of ``new``.
     """
     result = new.copy()
-    for key in new.keys(True, True):
+    for key in new.keys(True, True, is_leaf=is_leaf_nontensor):
         previous = None if key in but else old.get(key, None)
         if previous is not None:
             value = new.get(key)
-            result.set(key, torch.where(expand_as_right(mask, value), value, previous))
+            rows = mask if is_non_tensor(value) else expand_as_right(mask, value)
+            result.set(key, torch.where(rows, value, previous))
     return result
 
 

@@ -119,6 +119,11 @@ class ObservationStack(EnvTransform):
         spec = observation_spec[self.observation_key]
         leaves = spec.items(True, True) if isinstance(spec, Composite) else [((), spec)]
         for key, leaf in list(leaves):
+            if leaf.ndim == time:
+                raise ValueError(
+                    f"ObservationStack takes vectors or images, but {key or self.observation_key!r} is a "
+                    "number per row: make it a vector before, for instance with UnsqueezeTransform"
+                )
             shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
             stack = leaf.unsqueeze(time).expand(shape).clone()
             observation_spec[unravel_key((self.observation_key, key)) if key else self.observation_key] = (

@@ -99,6 +99,8 @@ class ActionWindow(Transform):
         frame = tensordict.get(keys.FRAME)
         if frame is None:
             raise KeyError(f"ActionWindow needs steps at {keys.FRAME!r}: see window_replay_buffer")
+        if frame.dtype not in (torch.int64, torch.int32):
+            raise ValueError(f"{keys.FRAME!r} numbers steps, as int64, and is {frame.dtype}")
         batch, before = tensordict.batch_size, self.history_length
         frame = frame.reshape(-1, 1)
         try:
@@ -153,6 +155,10 @@ def _checked(
         nested = observation.items(True, True)
         observations = {unravel_key((observation_key, key)): value for key, value in nested}
     for key, value in (*observations.items(), (keys.ACTION, action)):
+        if value.ndim < 2:
+            raise ValueError(
+                f"observations must be vectors or images, but {key!r} is a number per step: unsqueeze it"
+            )
         check_finite_steps(key, value)
     return observations, action, episode.flatten()
 
