@@ -26,7 +26,8 @@ import torch.distributed
 import torch.multiprocessing
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import TransformedEnv
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
 from lab.machine import facts_of_machine
@@ -259,6 +260,56 @@ def env_over_robosuite(clock: Clock) -> float:
     )
 
 
+class Particles(EnvBase):
+    """A batched simulator: ``n`` chains of masses, ten integration steps per control step."""
+
+    def __init__(self, n: int, masses: int = 32) -> None:
+        super().__init__(batch_size=[n])
+        self.observation_spec = Composite(observation=Unbounded((n, D_O)), shape=[n])
+        self.action_spec = Bounded(-1, 1, (n, D_A))
+        self.reward_spec = Unbounded((n, 1))
+        flags = {name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in ("done", "terminated")}
+        self.done_spec = Composite(flags, shape=[n])
+        self.state = torch.zeros(2, n, masses)
+
+    def _set_seed(self, seed: int | None) -> None:
+        torch.manual_seed(seed or 0)
+
+    def _seen(self) -> torch.Tensor:
+        return self.state[0, :, :D_O].clone()
+
+    def _reset(self, tensordict: TensorDict | None = None, **kwargs: Any) -> TensorDict:
+        self.state.zero_()
+        return TensorDict({"observation": self._seen()}, self.batch_size).update(self.done_spec.zero())
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        position, velocity = self.state
+        for _ in range(10):
+            force = position.roll(1, -1) - 2 * position + position.roll(-1, -1) - position.pow(3)
+            force[:, :D_A] += tensordict["action"]
+            velocity += 0.01 * force
+            position += 0.01 * velocity
+        found = {"observation": self._seen(), "reward": position.square().sum(-1, keepdim=True)}
+        return TensorDict(found, self.batch_size).update(self.done_spec.zero())
+
+
+def batched_chunk_step(clock: Clock) -> float:
+    chunks = torch.rand(1024, 3, H, D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    alone, env = Particles(1024), TransformedEnv(Particles(1024), policy_transforms(PRIOR))
+
+    def decisions() -> None:
+        data = env.reset()
+        for i in range(3):
+            data = env.step_mdp(env.step(data.set(("vla_action", "chunk"), chunks[:, i])))
+
+    def control_steps() -> None:
+        data = alone.reset()
+        for action in chunks.flatten(1, 2).unbind(1):
+            data = alone.step_mdp(alone.step(data.set("action", action)))
+
+    return clock.ratio(decisions, control_steps)
+
+
 def chunk_step_overhead(clock: Clock) -> float:
     # Statistics that leave actions as they are, so that both sides simulate the same.
     high = {"observation": torch.ones(D_O), "action": torch.ones(D_A)}
@@ -293,6 +344,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
+    "batched_chunk_step": (batched_chunk_step, "<= 1.15"),
 }
 
 

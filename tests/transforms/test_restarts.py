@@ -224,3 +224,30 @@ def test_vector_environments_that_restart_a_step_late_are_refused(execute):
     with pytest.raises(RuntimeError, match=r"NEXT_STEP.*AutoresetMode\.DISABLED"):
         env.rollout(2)
     env.close()
+
+
+@pytest.mark.slow
+def test_rows_of_brax_end_inside_their_chunks():
+    """Every decision played again from the state that it began with: ``pip install brax``."""
+    pytest.importorskip("brax")
+    from torchrl.envs import BraxEnv
+
+    base = BraxEnv("inverted_pendulum", batch_size=[3], device="cpu")
+    env = TransformedEnv(base, policy_transforms(PRIOR, execute=3, observation_steps=1))
+    env.set_seed(0)
+    played = env.rollout(12, break_when_any_done=False)
+    ended = played["next", "done"].squeeze(-1)
+    assert (ended & (played["next", keys.EXECUTED].squeeze(-1) < 3)).any() and not ended.all(0).any()
+    for decision in played.unbind(1):
+        data, chunk, after = decision.select("state"), decision[keys.CHUNK], decision["next"]
+        total = torch.zeros(3, 1)
+        for i in range(3):
+            going = i < after[keys.EXECUTED].squeeze(-1)
+            result = base.step(data.set("action", chunk[:, i]))["next"]
+            total[going] += result["reward"][going]
+            for row in going.nonzero().flatten().tolist():
+                if i + 1 == after[keys.EXECUTED][row]:
+                    torch.testing.assert_close(after["observation"][row, 0], result["observation"][row])
+                    assert result["done"][row] == after["done"][row]
+            data = result.select("state")
+        torch.testing.assert_close(after["reward"], total)
