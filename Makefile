@@ -9,7 +9,7 @@ PLUGIN := plugins/lerobot_policy_warmprior
 GROOT := .venv-groot
 GROOT_NEEDS := tests/lerobot/groot_n15.txt
 
-.PHONY: install benchmark throughput test test-slow test-groot-n15 lint fuzz results docs clean
+.PHONY: install benchmark throughput test test-slow test-groot-n15 latest lint fuzz results docs clean
 
 install: .venv/installed
 
@@ -49,6 +49,15 @@ $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 test-groot-n15: $(GROOT)/installed
 	$(GROOT)/bin/python -m pytest tests/lerobot/test_ports.py tests/lerobot/test_groot_n15.py $(ARGS)
 
+# The newest packages that the bounds of pyproject.toml admit, without constraints.txt.
+LATEST := .venv-latest
+latest:
+	$(PYTHON) -m venv $(LATEST)
+	$(LATEST)/bin/python -m pip install --quiet --upgrade pip
+	$(LATEST)/bin/python -m pip install --quiet --upgrade --editable ".[$(EXTRAS)]"
+	$(LATEST)/bin/python -m pip install --quiet --no-deps --editable $(PLUGIN)
+	$(LATEST)/bin/python -m pytest -n logical --dist loadfile -m "not slow" $(ARGS)
+
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -66,4 +75,4 @@ docs: install
 	$(BIN)/sphinx-build -W -q -b html -d build/doctrees $(ARGS) docs docs/_build
 
 clean:
-	rm -rf .venv $(GROOT) docs/_build docs/auto_tutorials build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv $(GROOT) $(LATEST) docs/_build docs/auto_tutorials build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

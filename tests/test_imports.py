@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import warmprior
 
@@ -159,3 +162,33 @@ def test_scripts_find_the_lab_by_themselves_and_its_files_say_what_they_hold():
     for path in BENCHMARKS.glob("lab/**/*.py"):
         first, *_ = ast.get_docstring(ast.parse(path.read_text())).splitlines()
         assert first.endswith("."), path
+
+
+def ran(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a process of its own."""
+    environment = {**os.environ, **environment}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_a_renderer_that_cannot_be_loaded_stops_no_import(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "OpenGL").mkdir()  # as without the library: PyOpenGL raises this
+    error = "AttributeError(\"'NoneType' object has no attribute 'glGetError'\")"
+    (tmp_path / "OpenGL" / "__init__.py").write_text(f"raise {error}\n")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    code = "import os, warmprior, mujoco; print(os.environ.get('MUJOCO_GL'), warmprior.__version__)"
+    done = ran(code, MUJOCO_GL="osmesa", PYTHONPATH=path)
+    assert done.stdout.split() == ["None", warmprior.__version__]
+    assert "MUJOCO_GL=osmesa" in done.stderr and "glGetError" in done.stderr
+
+
+def test_folders_are_used_without_locks_where_the_system_has_none(tmp_path):
+    code = "import sys; sys.modules['fcntl'] = None\n"
+    code += "import warmprior.training, pathlib; from warmprior.io.files import exclusive\n"
+    code += f"with exclusive(pathlib.Path({str(tmp_path / 'new')!r})) as _: print('inside')"
+    done = ran(code)
+    assert done.stdout.split() == ["inside"]
+    assert str(tmp_path / "new") in done.stderr and "one process" in done.stderr

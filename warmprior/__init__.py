@@ -8,11 +8,16 @@ name; parts of them need the extra ``warmprior[sim]``.
 
 from importlib.metadata import version
 
-from warmprior import modules, objectives, rl, transforms
-from warmprior.modules import *  # noqa: F403
-from warmprior.objectives import *  # noqa: F403
-from warmprior.rl import *  # noqa: F403
-from warmprior.transforms import *  # noqa: F403
+from warmprior.io.renderer import leave_out_broken_renderer
+
+leave_out_broken_renderer()  # before TorchRL is imported
+
+# isort: split
+from warmprior import modules, objectives, rl, transforms  # noqa: E402
+from warmprior.modules import *  # noqa: F403, E402
+from warmprior.objectives import *  # noqa: F403, E402
+from warmprior.rl import *  # noqa: F403, E402
+from warmprior.transforms import *  # noqa: F403, E402
 
 __version__ = version("warmprior")
 
