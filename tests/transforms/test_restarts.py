@@ -174,6 +174,15 @@ def test_workers_may_restart_by_themselves():
         torch.testing.assert_close(found["next", key].squeeze(1), expected["next", key])
 
 
+def test_batches_inside_of_workers_take_single_steps():
+    def make():
+        return AutoResetEnv(Auto(restarts=True), AutoResetTransform())
+
+    env = TransformedEnv(SerialEnv(2, make), policy_transforms(PRIOR, execute=2))
+    with pytest.raises(RuntimeError, match="execute=1"):
+        env.reset()
+
+
 class Walk(gymnasium.Env):
     """Gymnasium's counterpart of a row of :class:`Rows`."""
 

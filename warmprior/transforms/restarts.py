@@ -8,6 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.libs.gym import GymWrapper
 from torchrl.envs.transforms import (
     AutoResetTransform,
@@ -19,6 +20,9 @@ from torchrl.envs.transforms import (
 
 NATIVE = "_torchrl_native_autoreset"
 """TorchRL's mark of an environment whose steps show the next episode's first observation at an end."""
+
+
+_BY_THEMSELVES = (AutoResetTransform, VecGymEnvTransform)
 
 
 class Restarts:
@@ -49,7 +53,11 @@ class Restarts:
         several = simulator.numel() > 1
         self.native = several and bool(container.__dict__.get(NATIVE, False))
         self.needed = several and self._mode == "DISABLED"
-        alone = any(isinstance(t, AutoResetTransform | VecGymEnvTransform) for t in below)
+        alone = any(isinstance(t, _BY_THEMSELVES) for t in below)
+        if isinstance(simulator, BatchedEnvBase) and simulator.batch_size[1:].numel() > 1:  # in each worker
+            described = simulator.meta_data
+            texts = [part.env_str for part in (described if isinstance(described, list) else [described])]
+            alone = alone or any(kind.__name__ in text for kind in _BY_THEMSELVES for text in texts)
         self._alone = several and alone and not self.native
 
     def check(self, execute: int) -> None:
