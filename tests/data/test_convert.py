@@ -129,6 +129,34 @@ def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypat
     assert [p.name for p in folder.parent.iterdir()] == ["data"]
 
 
+@pytest.mark.parametrize("rewards", ["shaped", "zero", "none"])
+def test_what_rewards_do_not_say_is_not_written(tmp_path, rewards):
+    from lerobot.datasets import LeRobotDataset
+
+    path, env_args = tmp_path / "lift.hdf5", env_args_15("lift")
+    env_args["env_kwargs"]["reward_shaping"] = rewards == "shaped"
+    write_robomimic_file(path, task="lift", lengths=(4, 3), env_args=env_args)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            steps = len(demo["actions"])
+            del demo["rewards"]
+            if rewards != "none":
+                demo["rewards"] = np.linspace(0.4, 1.0, steps) if rewards == "shaped" else np.zeros(steps)
+    dataset = LeRobotDataset("local/test", root=convert_robomimic(path, tmp_path / "out"))
+    written = {"next.reward", "next.success"} & set(dataset.features)
+    assert written == ({"next.reward", "next.success"} if rewards == "shaped" else set())
+    if rewards == "shaped":
+        assert [bool(dataset[i]["next.success"]) for i in range(7)] == [
+            *[False] * 3,
+            True,
+            False,
+            False,
+            True,
+        ]
+    mine = LeRobotDemonstrations(tmp_path / "out").data
+    assert not equal(mine, RobomimicDemonstrations(path).data)
+
+
 def test_what_cannot_be_converted(tmp_path):
     path, folder = tmp_path / "lift.hdf5", tmp_path / "out"
     with pytest.raises(FileNotFoundError, match="no such file"):

@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
+from warmprior.data import RobomimicDemonstrations
 from warmprior.data.hdf5 import RobomimicReader, read_index
 from warmprior.data.replay import DatasetError
 
@@ -53,7 +58,114 @@ def test_unknown_environment_uses_what_it_finds(tmp_path):
             read_index(path, observation_keys=nothing)
 
 
+def test_unknown_environment_keeps_what_is_no_robots(tmp_path):
+    """A goal by a name of its own: a policy that is blind to it would learn nothing, without a word."""
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, env_args=env_args_15("lift") | {"env_name": "Own"})
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            steps = len(demo["actions"])
+            demo["obs/goal"] = np.full((steps, 2), 0.25)
+            demo["obs/door_open"] = np.zeros(steps, bool)
+            demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
+            demo["obs/language"] = np.array([b"open"] * steps)
+            demo.create_group("obs/nested")
+    index = read_index(path)
+    assert index.observation_keys == (
+        *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "door_open", "goal"),
+    )
+    assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
+
+
+def test_files_without_rewards(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path)
+    with_rewards = RobomimicDemonstrations(path).data
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1/rewards"]
+    with pytest.raises(DatasetError, match=r"file\.hdf5: data/demo_1 .*data/demo_0.*'rewards'"):
+        read_index(path)
+    with h5py.File(path, "a") as file:
+        for number in (0, 2):
+            del file[f"data/demo_{number}/rewards"]
+    data = RobomimicDemonstrations(path).data
+    assert not data["next", "reward"].any() and not data["next", "terminated"].any()
+    assert torch.equal(data["next", "truncated"], data["next", "done"])
+    for key in ("observation", "action", "episode", ("next", "done")):
+        assert torch.equal(data[key], with_rewards[key])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "solved"),
+    [({}, [False, True]), ({"reward_scale": 2.0}, [False, False]), ({"reward_scale": None}, [False, False])],
+)
+def test_a_shaped_reward_is_no_success_before_its_scale(tmp_path, kwargs, solved):
+    path, env_args = tmp_path / "file.hdf5", env_args_15("square")
+    env_args["env_kwargs"] |= {"reward_shaping": True, **kwargs}
+    write_robomimic_file(path, lengths=(4, 3), env_args=env_args)
+    with h5py.File(path, "a") as file:
+        file["data/demo_0/rewards"][...] = [0.1, 0.2, 0.5, 0.9]
+        file["data/demo_1/rewards"][...] = [0.1, 0.5, 1.0]
+    data = RobomimicDemonstrations(path).data
+    assert data["next", "terminated"][[3, 6], 0].tolist() == solved
+    assert not (data["next", "terminated"] & data["next", "truncated"]).any()
+
+
 # ---------------------------------------------------------------------------- bad files
+def test_a_raw_recording_of_robosuite(tmp_path):
+    path = tmp_path / "demo.hdf5"
+    write_robomimic_file(path)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            del demo["obs"], demo["rewards"], demo["dones"]
+    with pytest.raises(DatasetError, match=r"demo\.hdf5: data/demo_0 .*'obs'.*states"):
+        read_index(path)
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["env_args"], file["data"].attrs["total"]
+        file["data"].attrs["env"] = "NutAssemblySquare"
+    with pytest.raises(DatasetError, match=r"demo\.hdf5: .*'env_args'.*'obs'.*states.*low_dim"):
+        read_index(path)
+
+
+def test_a_file_that_another_process_writes(square_file):
+    path, _ = square_file
+    code = f"import h5py, sys; f = h5py.File({str(path)!r}, 'a'); print('open', flush=True); sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as other:
+        assert other.stdout.readline() == "open\n"
+        with pytest.raises(DatasetError, match=r"square\.hdf5: another process .*HDF5_USE_FILE_LOCKING"):
+            read_index(path)
+        other.stdin.close()
+    read_index(path)
+
+
+def test_a_flipped_bit_in_a_name(square_file):
+    """HDF5 then has two demos of a name, and gives the first for both."""
+    path, _ = square_file
+    # Of the heap of names; masks come after it.
+    path.write_bytes(path.read_bytes().replace(b"demo_1\0", b"demo_0\0", 1))
+    with h5py.File(path) as file:
+        assert list(file["data"]).count("demo_0") == 2
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data .*'demo_0' twice"):
+        read_index(path)
+
+
+def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1"]
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data\.attrs\['total'\] counts 47 .* 42"):
+        read_index(path)
+    assert len(read_index(path, filter_key="train").demos) == len(read_index(path, demos=2).demos) == 2
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["total"] = "many"
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data\.attrs\['total'\]"):
+        read_index(path)
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["total"]
+    assert len(read_index(path).demos) == 2
+
+
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"absent\.hdf5: no such file"):
         read_index(tmp_path / "absent.hdf5")

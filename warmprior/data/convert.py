@@ -13,12 +13,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from warmprior.checks import check_choice
 from warmprior.data.hdf5 import read_index, read_masks, read_origin
 from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
-from warmprior.data.replay import DatasetError, DatasetIndex
+from warmprior.data.replay import DatasetError, DatasetIndex, solved
 from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
@@ -98,7 +99,10 @@ def convert_robomimic(
 
 
 def _features(
-    index: DatasetIndex, layout: Mapping[str, Mapping[str, int]], images: str | None
+    index: DatasetIndex,
+    layout: Mapping[str, Mapping[str, int]],
+    outcome: Mapping[str, torch.Tensor],
+    images: str | None,
 ) -> dict[str, Any]:
     def feature(dtype: str, shape: tuple[int, ...], names: list[str] | None) -> dict[str, Any]:
         return {"dtype": dtype, "shape": shape, "names": names}
@@ -110,8 +114,10 @@ def _features(
     pixels = (index.image_size, index.image_size, 3)
     return (
         {name: feature("float32", (size,), names[name]) for name, size in sizes.items()}
-        | {REWARD: feature("float32", (1,), None)}
-        | {flag: feature("bool", (1,), None) for flag in ("next.done", SUCCESS)}
+        | {
+            name: feature("bool" if value.dtype == torch.bool else "float32", (1,), None)
+            for name, value in outcome.items()
+        }
         | {
             _camera(key): feature(str(images), pixels, ["height", "width", "channels"])
             for key in index.image_keys
@@ -133,16 +139,17 @@ def _write(
         demos=len(index.demos),
         image_keys=index.image_keys,
         storage="memmap" if images else "memory",
+        as_recorded=True,
     ).data
+    outcome = _outcome(data, index)
     dataset = datasets.LeRobotDataset.create(
-        f"local/{root.name}", fps, _features(index, layout, images), root=root, use_videos=images == "video"
+        f"local/{root.name}",
+        fps,
+        _features(index, layout, outcome, images),
+        root=root,
+        use_videos=images == "video",
     )
-    numbers = {
-        "action": data[ACTION],
-        REWARD: data["next", "reward"],
-        "next.done": data["next", "done"],
-        SUCCESS: data["next", "reward"] > 0,
-    }
+    numbers = {"action": data[ACTION], **outcome}
     vector = data[OBSERVATION, STATE] if images else data[OBSERVATION]
     parts = dict(zip(index.observation_keys, vector.split(index.observation_dims, -1), strict=True))
     for feature, widths in layout.items():
@@ -167,6 +174,15 @@ def _write(
         dataset.finalize()
     described = json.dumps(_description(index, layout), indent=1)
     write_atomic(root / DESCRIPTION, lambda file: file.write_text(described))
+
+
+def _outcome(data: TensorDictBase, index: DatasetIndex) -> dict[str, torch.Tensor]:
+    """What is known of the episodes: rewards that are all zero say nothing, nor that the task failed."""
+    reward = data["next", "reward"]
+    success = solved(reward, index.env_args)
+    known = {"next.done": data["next", "done"]}
+    known |= {REWARD: reward} if reward.any() else {}
+    return known | ({SUCCESS: success} if success.any() else {})
 
 
 def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:

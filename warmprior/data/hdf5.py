@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import product
+from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -41,6 +41,9 @@ _MAX_SOFT_LINKS = 16
 _AGAIN = "Copy or download it again."
 _COPY = "That one is not read: copy the data into this file."
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
+_OBSERVE = (
+    "take the low_dim file, or replay states (robomimic: convert_robosuite.py, dataset_states_to_obs.py)"
+)
 
 
 @contextmanager
@@ -55,9 +58,12 @@ def reading(parent: h5py.Group, name: str) -> Iterator[None]:
 
 
 def names(group: h5py.Group) -> list[str]:
-    """The names in a group, sorted."""
+    """The names in a group, sorted, each once."""
     with reading(group, ""):
-        return sorted(group)
+        found = sorted(group)
+    if twice := [name for name, following in pairwise(found) if name == following]:
+        raise DatasetError(f"{_place(group)} has the name {twice[0]!r} twice, so another is lost. {_AGAIN}")
+    return found
 
 
 def member(
@@ -153,6 +159,13 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
         raise FileNotFoundError(f"{path}: no such file; check the path")
     try:
         file = h5py.File(path, "r")
+    except BlockingIOError as error:
+        raise DatasetError(
+            f"{path}: another process has it open to write ({error}): close it there, or wait; on a file "
+            "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
+        ) from error
+    except PermissionError:
+        raise PermissionError(f"{path}: it may not be read here: change its permissions") from None
     except OSError as error:
         size = path.stat().st_size
         raise DatasetError(f"{path}: not a readable HDF5 file ({size} bytes; {error}). {_AGAIN}") from error
@@ -204,15 +217,28 @@ def _selected(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
 
 
 def _described(file: h5py.File, name: str) -> Any:
-    """Read an attribute of the demos, which is JSON."""
+    """Read an attribute of the demos, which is JSON; ``None`` if there is none."""
     with reading(file, f"data.attrs[{name!r}]"):
-        return json.loads(file["data"].attrs[name])
+        attributes = file["data"].attrs
+        return json.loads(attributes[name]) if name in attributes else None
+
+
+def _check_total(file: h5py.File, steps: int) -> None:
+    """Compare the steps of all demos with what the file counts, if it does: damage can hide a demo."""
+    with reading(file, "data.attrs['total']"):
+        total = file["data"].attrs.get("total")
+        differs = total is not None and int(total) != steps
+    if differs:
+        raise DatasetError(
+            f"{file.filename}: data.attrs['total'] counts {total} steps, and the demos have {steps}: one is "
+            "lost, or not whole. Copy or download it again, or correct the attribute."
+        )
 
 
 def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
     """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
     with open_robomimic(path) as file:
-        rendering = _described(file, "rendering") if "rendering" in file["data"].attrs else None
+        rendering = _described(file, "rendering")
         states = member(file, f"data/{demo}/states", "dataset")
         with reading(file, f"data/{demo}/states"):
             state = np.asarray(states[0], np.float64) if states is not None and states.size else None
@@ -224,9 +250,11 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
     what, steps, widths = _place(demo), 0, {}
     observations = member(demo, "obs", "group")
     if observations is None:
-        raise DatasetError(f"{what} has no group 'obs': take the low_dim file, or dataset_states_to_obs.py")
+        raise DatasetError(f"{what} has no group 'obs': it holds no observations: {_OBSERVE}")
     for key in ("actions", "rewards", *keys):
         dataset = member(demo, key, "dataset")
+        if dataset is None and key == "rewards":  # which cloning does not need
+            continue
         if dataset is None:
             others = [*names(demo), *(f"obs/{name}" for name in names(observations))]
             raise unknown(what, "dataset", key, others)
@@ -239,6 +267,17 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
             raise DatasetError(f"{what}/{key} has {kind}, expected vectors of numbers: leave the key out")
         widths[key] = 1 if len(shape) == 1 else shape[1]
     return steps, widths
+
+
+def _is_vector(observations: h5py.Group, key: str) -> bool:
+    """Whether an observation holds a number, or a vector of them, per step."""
+    with reading(observations, key):
+        item = _follow(observations, key, _MAX_SOFT_LINKS)
+        return (
+            isinstance(item, require("h5py", "sim").Dataset)
+            and len(item.shape or ()) in (1, 2)
+            and item.dtype.kind in "fiub"
+        )
 
 
 def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int, str]:
@@ -277,16 +316,27 @@ def read_index(
         selected = _selected(file, filter_key)
         check_count(path, demos, len(selected))
         selected = selected[:demos]
-        env_args = check_env_args(f"{path}: data.attrs['env_args']", _described(file, "env_args"))
-        task = task_of_env(env_args)
         observations = member(file, f"data/{selected[0]}/obs", "group")
         available = () if observations is None else tuple(names(observations))
+        described = _described(file, "env_args")
+        if described is None:
+            lacks = f"{path}: data has no attribute 'env_args', which names the environment"
+            if observations is not None:
+                raise DatasetError(f"{lacks}: add it, the JSON of env_name and env_kwargs")
+            raise DatasetError(
+                f"{lacks}, and its demos have no group 'obs': recordings of robosuite hold states without "
+                f"observations: {_OBSERVE}"
+            )
+        env_args = check_env_args(f"{path}: data.attrs['env_args']", described)
+        task = task_of_env(env_args)
         if observation_keys is not None:
             keys = tuple(observation_keys)
         elif task is not None:
             keys = task.low_dim_keys
         else:
-            keys = tuple(key for key in low_dim_keys(arms=2) if key in available)
+            known = [key for key in low_dim_keys(arms=2) if key in available]
+            others = [key for key in available if key not in known and not key.startswith("robot")]
+            keys = (*known, *(key for key in others if _is_vector(observations, key)))
         wanted = [f"obs/{key}" for key in keys]
         if poses:
             actions = member(file, f"data/{selected[0]}/actions", "dataset")
@@ -304,6 +354,8 @@ def read_index(
             if demo is None:  # listed, but not to be found: its index is damaged
                 raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
             steps, widths = _widths(demo, wanted)
+            if lengths and widths.keys() != expected.keys():
+                raise DatasetError(f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'")
             for key, width in expected.items():
                 if widths[key] != width:
                     raise DatasetError(
@@ -313,6 +365,8 @@ def read_index(
             expected, whose = widths, f"data/{selected[0]} of {env_args['env_name']}"
             lengths.append(steps)
             sides = _image_sizes(demo, image_keys, steps) | sides
+        if filter_key is None and demos is None:
+            _check_total(file, sum(lengths))
     return DatasetIndex(
         path=path,
         demos=selected,
@@ -337,6 +391,12 @@ class RobomimicReader(DemonstrationReader):
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
         """Read rows of one array of a demo, block by block; ``out`` may be a strided view."""
         dataset: Any = member(self.file, f"data/{demo}/{key}", "dataset")
+        if dataset is None and key == "rewards":
+            out[...] = 0
+            return
+        if dataset is None:
+            present = names(self.file[f"data/{demo}"])
+            raise unknown(f"{self.file.filename}: data/{demo}", "dataset", key, present)
         what = f"{self.name(demo, key)} (shape {dataset.shape})"
         for start in range(0, len(out), BLOCK):
             rows = out[start : start + BLOCK]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -20,10 +20,11 @@ from tqdm import tqdm
 
 from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.env_args import absolute_actions as to_absolute
-from warmprior.envs.env_args import delta_conventions, modernize_env_args
+from warmprior.envs.env_args import declared_actions, delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
+from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -73,6 +74,8 @@ class DatasetIndex:
     task: TaskSpec | None
 
     def __post_init__(self) -> None:
+        if not self.demos:
+            raise DatasetError(f"{self.path}: no demonstrations are chosen; the mask names none")
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observation_keys: {listed}")
@@ -89,7 +92,10 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
+        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them.
+
+        Rewards that are not recorded are zeros.
+        """
 
     @abstractmethod
     def images(self, demo: str, key: str, out: Tensor) -> None:
@@ -145,6 +151,50 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advi
 
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
+
+LOOKED_AT = 20  # demos from which it is told what actions are
+POSES = 0.25  # between 0.01, of poses a control step ahead of the hand, and 1, of what knows nothing of it
+
+
+def _are_poses(index: DatasetIndex, reader: DemonstrationReader, declared: tuple[str, str] | None) -> bool:
+    """Whether actions are poses in the world that ``env_args`` declare as deltas (``low_dim_abs.hdf5``).
+
+    Their positions tell: poses are near the hand, where deltas are not, however long or short. A
+    ``DatasetError`` if ``env_args`` are wrong in another way.
+    """
+    arms, rest = divmod(index.action_dim, 7)
+    hands = [f"robot{arm}_eef_pos" for arm in range(arms)]
+    if declared is None or rest or not set(hands) <= set(index.available_keys):
+        return False
+    lengths = [min(length, BLOCK) for length in index.lengths[:LOOKED_AT]]
+    ends = np.cumsum([0, *lengths])
+    actions, here = np.empty((ends[-1], arms, 7)), np.empty((ends[-1], arms, 3))
+    for demo, (start, stop) in zip(index.demos, pairwise(ends), strict=False):
+        reader.numbers(demo, "actions", actions[start:stop].reshape(-1, 7 * arms))
+        for arm, key in enumerate(hands):
+            reader.numbers(demo, f"obs/{key}", here[start:stop, arm])
+    there = actions[..., :3]
+    in_world = _share(there - here, there)
+    (kind, frame), path = declared, index.path
+    if kind == "absolute":
+        if frame == "world" and in_world > 1:
+            raise DatasetError(
+                f"{path}: actions are no poses near robot0_eef_pos, but env_args declare absolute ones: "
+                "correct control_delta (input_type) there"
+            )
+        return False
+    if in_world >= POSES and _share(*(v - v.mean(0) for v in (there - here, there))) < POSES:
+        raise DatasetError(
+            f"{path}: actions are poses in another frame than robot0_eef_pos, but env_args declare deltas: "
+            "correct control_delta (input_type) and input_ref_frame there"
+        )
+    return in_world < POSES
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    """Quotient of the sums of squares; infinite where there is nothing to compare with."""
+    of = float(np.square(whole).sum())
+    return float(np.square(part).sum()) / of if of else np.inf
 
 
 def _allocate(
@@ -203,6 +253,18 @@ def _reserve(mapped: Any) -> None:
         os.close(file)
 
 
+def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:
+    """Read recorded poses, with 6-d rotations instead of rotation vectors."""
+    arms = out.shape[-1] // 10
+    for first in range(0, len(out), BLOCK):
+        rows = out[first : first + BLOCK]
+        recorded = np.empty((len(rows), 7 * arms))
+        reader.numbers(demo, "actions", recorded, first)
+        place, turn, gripper = torch.from_numpy(recorded).unflatten(-1, (arms, 7)).split((3, 3, 1), -1)
+        turn = matrix_to_rotation_6d(rotvec_to_matrix(turn))
+        rows[...] = torch.cat((place, turn, gripper), -1).flatten(-2).numpy()
+
+
 def _read_absolute(
     reader: DemonstrationReader, demo: str, out: np.ndarray, output_max: Tensor, base_rotation: Tensor
 ) -> None:
@@ -229,29 +291,38 @@ def _read_absolute(
         ).numpy()
 
 
-def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader, absolute: bool) -> None:
+def solved(reward: Tensor, env_args: Mapping[str, Any]) -> Tensor:
+    """Where a reward says that the task is solved, bool: where it is robosuite's ``reward_scale``.
+
+    Shaped rewards are positive before that. Where the scale is ``None`` they do not say it.
+    """
+    scale = env_args.get("env_kwargs", {}).get("reward_scale", 1.0)
+    return reward >= (np.inf if scale is None else scale * (1 - 1e-6))
+
+
+def _fill(
+    index: DatasetIndex,
+    data: TensorDictBase,
+    reader: DemonstrationReader,
+    read_actions: Callable[[str, np.ndarray], None],
+) -> None:
     observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
-    if absolute:
-        output_max, base_rotation = delta_conventions(index.env_args)
     # Of what takes long: images are unpacked one by one.
     bar = tqdm(index.demos, f"read {index.path.name}", unit="demo", disable=not index.image_keys)
     for episode, (demo, (start, stop)) in enumerate(zip(bar, pairwise(rows), strict=True)):
         for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
             reader.numbers(demo, f"obs/{key}", observation[start:stop, left:right])
-        if absolute:
-            _read_absolute(reader, demo, action[start:stop], output_max, base_rotation)
-        else:
-            reader.numbers(demo, "actions", action[start:stop])
+        read_actions(demo, action[start:stop])
         reader.numbers(demo, "rewards", reward[start:stop])
         for key in index.image_keys:
             reader.images(demo, key, data[OBSERVATION, key][start:stop])
         data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)
-    success = data["next", "reward"][last] > 0
+    success = solved(data["next", "reward"][last], index.env_args)
     for key, value in (("done", True), ("terminated", success), ("truncated", ~success)):
         flag = data["next", key]
         flag.zero_()
@@ -267,6 +338,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         reader: DemonstrationReader,
         *,
         absolute_actions: bool = False,
+        as_recorded: bool = False,
         storage: Literal["memory", "memmap"] = "memory",
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
@@ -276,19 +348,37 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         device = torch.device(device)
         if storage == "memmap" and device.type != "cpu":
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
-        action_dim = index.action_dim
+        action_dim, declared, conventions = index.action_dim, None, None
         if index.env_args or absolute_actions:
             try:
-                modernize_env_args(index.env_args)
-                arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
+                declared = None if as_recorded else declared_actions(index.env_args)
+                solved(torch.zeros(1), index.env_args)
+                conventions = delta_conventions(index.env_args) if absolute_actions else None
             except Exception as error:  # whatever their unexpected structure leads to
                 raise DatasetError(f"{index.path}: env_args do not suit these actions: {error!r}") from error
-        if absolute_actions:
+
+        if conventions is not None:
+            arms = len(conventions[1])
             if action_dim != 7 * arms:
                 raise DatasetError(f"{index.path}: actions have {action_dim} columns, not {7 * arms}")
             action_dim = 10 * arms
         data = _allocate(index, action_dim, storage, scratch_dir)
-        _fill(index, data, reader, absolute_actions)
+        poses = _are_poses(index, reader, declared)
+        if poses and conventions is None:
+            raise DatasetError(
+                f"{index.path}: actions are absolute poses, but env_args declare deltas: take "
+                "absolute_actions=True (--actions absolute), or correct control_delta (input_type) there"
+            )
+
+        def read_actions(demo: str, out: np.ndarray) -> None:
+            if poses:
+                _read_poses(reader, demo, out)
+            elif conventions is not None:
+                _read_absolute(reader, demo, out, *conventions)
+            else:
+                reader.numbers(demo, "actions", out)
+
+        _fill(index, data, reader, read_actions)
         self._index = index
         super().__init__(
             storage=TensorStorage(data if storage == "memmap" else data.to(device)),

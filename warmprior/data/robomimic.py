@@ -19,9 +19,10 @@ class RobomimicDemonstrations(DemonstrationReplay):
     - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side; with images nested,
       ``("observation", "state")`` ``[N, d_s]`` and each as uint8 ``[N, 3, size, size]``;
     - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
-    - ``("next", "reward")`` ``[N, 1]`` float32;
+    - ``("next", "reward")`` ``[N, 1]`` float32, zeros if none is recorded;
     - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
-      on the last step of each demo, terminated there if its reward is positive, else truncated;
+      on the last step of each demo, terminated there if its reward is that of a solved task (robosuite's
+      ``reward_scale``, 1 by default), else truncated;
     - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row itself.
 
     Names, shapes and masks are checked before values are read.
@@ -31,12 +32,14 @@ class RobomimicDemonstrations(DemonstrationReplay):
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: how many to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
-            unknown environment the object and every robot's pose and gripper.
+            unknown environment the object, every robot's pose and gripper, and all vectors of no robot.
         image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; take
             ``storage="memmap"`` where they are many.
         absolute_actions: turn the recorded pose deltas into absolute poses
-            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        **kwargs: ``storage``: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default
+            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm. Recorded poses that
+            the file declares as deltas (``low_dim_abs.hdf5``) are taken as they are.
+        **kwargs: ``as_recorded``: also read such poses without ``absolute_actions``, as they stand in the
+            file; ``storage``: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default
             temporary ones; ``device`` of the tensors in memory; and ``batch_size``, ``sampler``,
             ``transform``, ``prefetch``, ``pin_memory`` or ``generator`` of TorchRL's.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -26,6 +26,8 @@ def environment_description(
     observation_steps: int,
     actions: Literal["delta", "absolute"] = "delta",
     images: Mapping[str, Any] | None = None,
+    *,
+    low_dim_keys: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
 
@@ -39,6 +41,9 @@ def environment_description(
             :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what it
             sees besides, see :class:`RobosuiteEnv`.
 
+    Keyword Args:
+        low_dim_keys: what a policy without images sees, where that is not the task's own.
+
     Examples:
         >>> from warmprior.envs import environment_description
         >>> environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
@@ -49,6 +54,8 @@ def environment_description(
         "robosuite": {"env_args": dict(env_args), "style": style},
         "observation_steps": observation_steps,
     }
+    if low_dim_keys is not None:
+        description["robosuite"]["low_dim_keys"] = list(low_dim_keys)
     if actions != "delta":
         description["actions"] = actions
     if images is not None:
@@ -136,7 +143,7 @@ def _is_complete(description: Any) -> bool:
         images = description.get("images", dict.fromkeys(_IMAGES))
         return (
             description.keys() - {"actions", "images"} == {"robosuite", "observation_steps"}
-            and description["robosuite"].keys() == {"env_args", "style"}
+            and description["robosuite"].keys() - {"low_dim_keys"} == {"env_args", "style"}
             and description.get("actions", "delta") in ("delta", "absolute")
             and images.keys() == set(_IMAGES)
         )

@@ -90,6 +90,21 @@ def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
     return new
 
 
+def _arm_controller(env_args: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Keyword arguments of an environment for robosuite 1.5, and what they say of the first arm."""
+    kwargs = modernize_env_args(env_args)["env_kwargs"]
+    config = kwargs.get("controller_configs") or {"body_parts": {"right": {"type": "OSC_POSE"}}}
+    return kwargs, (config[0] if isinstance(config, list) else config)["body_parts"]["right"]
+
+
+def declared_actions(env_args: Mapping[str, Any]) -> tuple[str, str] | None:
+    """What an ``OSC_POSE`` controller reads, ``"delta"`` or ``"absolute"``, and its frame; or ``None``."""
+    _, part = _arm_controller(env_args)
+    if part.get("type") != "OSC_POSE":
+        return None
+    return part.get("input_type", "delta"), part.get("input_ref_frame", "base")
+
+
 def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """In which units and frame an environment reads its pose deltas.
 
@@ -107,9 +122,7 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
         >>> output_max.tolist(), base_rotation.shape
         ([0.05, 0.05, 0.05, 0.5, 0.5, 0.5], torch.Size([1, 3, 3]))
     """
-    kwargs = modernize_env_args(env_args)["env_kwargs"]
-    config = kwargs.get("controller_configs") or {"body_parts": {"right": {"type": "OSC_POSE"}}}
-    part = (config[0] if isinstance(config, list) else config)["body_parts"]["right"]
+    kwargs, part = _arm_controller(env_args)
     if part.get("type") != "OSC_POSE" or part.get("input_type", "delta") != "delta":
         kind = f"{part.get('type')} with input_type={part.get('input_type')!r}"
         raise ValueError(f"expected OSC_POSE deltas, got {kind}; read the actions as they are")

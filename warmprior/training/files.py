@@ -43,7 +43,12 @@ def recorded_task(
     actions: Literal["delta", "absolute"],
 ) -> dict[str, Any]:
     """Data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
-    description = environment_description(dataset.env_args, style, observation_steps, actions, images)
+    seen = None
+    if images is None and (dataset.task is None or dataset.observation_keys != dataset.task.low_dim_keys):
+        seen = dataset.observation_keys
+    description = environment_description(
+        dataset.env_args, style, observation_steps, actions, images, low_dim_keys=seen
+    )
     make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
     # positions, which range far, do not weigh little beside the gripper in the loss.

@@ -1,0 +1,129 @@
+"""What actions are, whatever a file declares: deltas of any size, or poses as in low_dim_abs.hdf5."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
+from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
+from warmprior.envs import delta_conventions
+
+HAND_TO_SITE = Rotation.from_euler("z", -90, degrees=True)
+BASE = np.array([-0.56, 0.0, 0.912])
+
+
+def _deltas(kind, steps, rng):
+    """Position deltas ``[steps, 3]``, as different devices record them."""
+    if kind == "keyboard":  # one key at a time, held for a while
+        held = np.repeat(np.eye(3)[rng.integers(3, size=steps // 4 + 1)], 4, axis=0)[:steps]
+        return 3.75 * held * rng.choice([-1, 0, 1], size=(steps, 1))
+    if kind == "slow":
+        return np.clip(0.04 * rng.normal(size=(steps, 3)), -1, 1)
+    if kind == "resting":  # hardly a motion
+        return np.where(rng.random((steps, 1)) < 0.9, 0.0, rng.normal(size=(steps, 3)))
+    goal = rng.normal(size=(steps // 20 + 1, 3)).repeat(20, axis=0)[:steps]
+    return np.clip(goal + 0.1 * rng.normal(size=(steps, 3)), -1, 1)
+
+
+def write(path, kind="scripted", stored="delta", task="lift", lengths=(40, 25), env_args=None):
+    """A file in which hands move as deltas ask; returns deltas and poses ``[N, 10 * arms]`` of all steps."""
+    env_args = env_args or env_args_14(task)
+    write_robomimic_file(path, lengths=lengths, task=task, env_args=env_args)
+    rng, every = np.random.default_rng(1), {"delta": [], "absolute": []}
+    arms = 2 if task == "transport" else 1
+    with h5py.File(path, "a") as file:
+        for number, steps in enumerate(lengths):
+            demo, columns = (
+                file[f"data/demo_{number}"],
+                {"delta": [], "absolute": [], "rotvec": [], "base": []},
+            )
+            for arm in range(arms):
+                move, turn = _deltas(kind, steps, rng), np.clip(rng.normal(size=(steps, 3)), -1, 1)
+                gripper = rng.choice([-1.0, 1.0], size=(steps, 1))
+                # The hand points down and lags behind what it is asked for.
+                start = np.array([0.0, 0.1 - 0.2 * arm, 1.0]) + 0.1 * rng.normal(size=3)
+                clipped = 0.05 * np.clip(move, -1, 1)
+                place = start + np.concatenate([np.zeros((1, 3)), 0.5 * clipped.cumsum(0)[:-1]])
+                hand = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(
+                    0.1 * rng.normal(size=(steps, 3))
+                )
+                demo[f"obs/robot{arm}_eef_pos"][...] = place
+                demo[f"obs/robot{arm}_eef_quat"][...] = hand.as_quat()
+                site = Rotation.from_rotvec(0.5 * turn) * hand * HAND_TO_SITE
+                rows = site.as_matrix()[:, :2].reshape(steps, 6)
+                columns["delta"] += [move, turn, gripper]
+                columns["absolute"] += [place + clipped, rows, gripper]
+                columns["rotvec"] += [place + clipped, site.as_rotvec(), gripper]
+                columns["base"] += [place + clipped - BASE, site.as_rotvec(), gripper]
+            demo["actions"][...] = np.concatenate(columns[stored], -1)
+            for name, values in every.items():
+                values.append(np.concatenate(columns[name], -1))
+    return {name: torch.from_numpy(np.concatenate(values)).float() for name, values in every.items()}
+
+
+KINDS = ("scripted", "keyboard", "slow", "resting")
+
+
+@pytest.mark.parametrize("task", ["lift", "transport"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_deltas_are_read_as_deltas(tmp_path, kind, task):
+    path = tmp_path / "low_dim.hdf5"
+    expected = write(path, kind, task=task)
+    assert torch.equal(RobomimicDemonstrations(path).data["action"], expected["delta"])
+    found = RobomimicDemonstrations(path, absolute_actions=True).data["action"]
+    torch.testing.assert_close(found, expected["absolute"], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("task", ["lift", "transport"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_declared_as_deltas(tmp_path, kind, task):
+    path = tmp_path / "low_dim_abs.hdf5"
+    expected = write(path, kind, "rotvec", task)
+    with pytest.raises(DatasetError, match=r"low_dim_abs\.hdf5: .*absolute_actions=True.*control_delta"):
+        RobomimicDemonstrations(path)
+    replay = RobomimicDemonstrations(path, absolute_actions=True)
+    torch.testing.assert_close(replay.data["action"], expected["absolute"], atol=1e-5, rtol=0)
+    delta_conventions(replay.env_args)  # an environment of deltas, towards these poses
+    # Whatever observations are chosen.
+    other = RobomimicDemonstrations(path, absolute_actions=True, observation_keys=["object"])
+    assert torch.equal(other.data["action"], replay.data["action"])
+    with h5py.File(path) as file:
+        recorded = np.concatenate([file[f"data/demo_{n}/actions"] for n in (0, 1)])
+    as_recorded = RobomimicDemonstrations(path, as_recorded=True).data["action"]
+    np.testing.assert_array_equal(as_recorded.numpy(), recorded.astype(np.float32))
+
+
+def test_poses_declared_as_poses(tmp_path):
+    path, env_args = tmp_path / "file.hdf5", env_args_14("lift")
+    env_args["env_kwargs"]["controller_configs"]["control_delta"] = False
+    write(path, stored="rotvec", env_args=env_args)
+    assert RobomimicDemonstrations(path).data["action"].shape == (65, 7)
+    with pytest.raises(DatasetError, match=r"file\.hdf5: env_args .*absolute"):
+        RobomimicDemonstrations(path, absolute_actions=True)
+    write(path, stored="delta", env_args=env_args)
+    with pytest.raises(DatasetError, match=r"file\.hdf5: .*robot0_eef_pos.*control_delta"):
+        RobomimicDemonstrations(path)
+
+
+def test_poses_in_the_frame_of_the_base(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write(path, stored="base", env_args=env_args_15("lift"))
+    for absolute in (False, True):
+        with pytest.raises(DatasetError, match=r"file\.hdf5: .*robot0_eef_pos.*input_ref_frame"):
+            RobomimicDemonstrations(path, absolute_actions=absolute)
+
+
+def test_a_converted_file_tells_the_same(tmp_path):
+    pytest.importorskip("lerobot")
+    from warmprior.data import LeRobotDemonstrations
+
+    expected = write(tmp_path / "low_dim_abs.hdf5", stored="rotvec")
+    folder = convert_robomimic(tmp_path / "low_dim_abs.hdf5", tmp_path / "converted")
+    with pytest.raises(DatasetError, match=r"converted: .*absolute_actions=True"):
+        LeRobotDemonstrations(folder)
+    found = LeRobotDemonstrations(folder, absolute_actions=True).data["action"]
+    torch.testing.assert_close(found, expected["absolute"], atol=1e-5, rtol=0)
