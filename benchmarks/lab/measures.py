@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -31,9 +32,12 @@ from warmprior.diagnostics import (
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history
+from warmprior.keys import EPISODE, OBSERVATION, STATE
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
+
+TRAINED_ON = "the TRAINING demonstrations (not held out)"
 
 # Ratios to the baseline: the entry of `curvature` that each compares.
 RATIOS = {
@@ -101,7 +105,8 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words.
 
-    A task of one's own has none: its training data.
+    A task of one's own has none: its training data. A ``ValueError`` if some of them were trained on: masks
+    may overlap, and files may have demonstrations in common.
     """
     place: Path | str
     task, chunk_length = policy.task(), policy.method.chunk_length
@@ -115,7 +120,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
         shared = SharedObservations(task.data.to(device), chunk_length, **shape)
         if len(shared) > count:
             shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
-        return shared, "the TRAINING demonstrations (not held out)"
+        return shared, TRAINED_ON
     if given is not None:
         place, words = given, ""
     elif policy.data.mask == "train":
@@ -134,8 +139,26 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
         words = f"{episodes} newly generated demonstrations"
     data, called = read_like(place, task.name, facts, mask)
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
-    data = copy.deepcopy(task.normalizer).to("cpu").normalize(data).to(device)
+    data = copy.deepcopy(task.normalizer).to("cpu").normalize(data)
+    trained, found = (set(_episodes(part)) for part in (task.data, data))
+    if common := found & trained:
+        if given is None or common != found:
+            raise ValueError(
+                f"{called} has {len(common)} of {len(found)} demonstrations in common with the training "
+                f"data, {facts['file']}: choose masks, or a --validation, without them"
+            )
+        words = TRAINED_ON
+    data = data.to(device)
     return SharedObservations(data, chunk_length, **shape, count=count, generator=generator), words or called
+
+
+def _episodes(data: TensorDictBase) -> list[str]:
+    """A digest of the observations of every demonstration."""
+    observation = data[OBSERVATION]
+    vector = observation[STATE] if isinstance(observation, TensorDictBase) else observation
+    lengths = [n for n in data[EPISODE].flatten().bincount().tolist() if n]
+    parts = vector.cpu().contiguous().split(lengths)
+    return [hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in parts]
 
 
 def straightness(

@@ -293,11 +293,7 @@ def read_like(
     found = opened(place, name, mask)
     if (theirs := task_name(found.index())) != name:  # before images are rendered
         raise ValueError(f"{place} holds demonstrations of {theirs}, but these policies are for {name}")
-    images = facts.get("images")
-    demos = min(facts["demonstrations"], len(found.index().demos))
-    called = found.name
-    if found.digest(image_names(images["cameras"] if images else ()), demos) == facts["sha256"]:
-        called = "the TRAINING demonstrations (not held out)"
+    images, called = facts.get("images"), found.name
     seen: dict[str, Any] = {"absolute_actions": facts.get("actions") == "absolute"}
     if images is not None:
         place = with_images(

@@ -160,10 +160,27 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
         with h5py.File(tmp_path / f"{name}.hdf5", "a") as file:
             for number in set(range(len(lengths))) - set(kept):
                 del file[f"data/demo_{number}"]
+            file["data"].attrs["total"] = sum(lengths[number] for number in kept)
     apart = tmp_path / "runs" / "apart"
     argv = options(tmp_path / "train.hdf5", apart, validation=tmp_path / "valid.hdf5", **few)
     assert curvature.main(argv) == 0
     assert stored(apart, "curvature") == stored(out, "curvature")
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_demonstrations_that_were_trained_on_are_not_held_out(tmp_path, given, capsys):
+    """Masks may overlap, and a copy of a file, in whatever format, has the same demonstrations."""
+    path, copy = tmp_path / "lift.hdf5", tmp_path / "copy.hdf5"
+    masks = {"train": [0, 1, 2], "valid": [2, 3]}
+    write_robomimic_file(path, lengths=(30, 5, 40, 25), task="lift", masks=masks)
+    shutil.copy(path, copy)
+    argv = options(path, tmp_path / "runs" / "out", mask="train", prior="past", observations=10)
+    argv += command_line(validation=copy) if given else []
+    line = refused(curvature.main, argv, capsys)
+    number = "3 of 4" if given else "1 of 2"
+    said = f"{'copy.hdf5' if given else 'lift.hdf5 (mask valid)'} has {number} demonstrations in common"
+    assert said in line and "(mask train)" in line
+    assert not list(tmp_path.rglob("*.safetensors"))
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 
@@ -10,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 from tensordict import TensorDict
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_env import Halfway, random_history
 from warmprior import (
@@ -17,6 +19,7 @@ from warmprior import (
     GaussianPrior,
     Normalizer,
     PastPrior,
+    PreconditionedNetwork,
     PreviewPrior,
     Prior,
     RealTimeChunking,
@@ -29,6 +32,7 @@ from warmprior.training.saved import load_policy, policy_config, save_policy
 
 H, D_A, D_O, TO = 3, 2, 5, 2
 ACTION = "normalizer.action_scale"
+MOMENT, WEIGHT = "ode.network.moments.source_variance", "ode.network.network.head.1.weight"
 
 
 def policy(prior=None, network=None, width=D_O, **options):
@@ -65,6 +69,7 @@ def rewrite(folder, change):
     tensors, config = load_state(folder / "model.safetensors")
     change(tensors, config)
     save_state(folder / "model.safetensors", tensors, config)
+    (folder / "config.json").unlink()
 
 
 TRANSFORMER = {"embedding_dim": 12, "num_layers": 2, "num_heads": 2}
@@ -199,6 +204,61 @@ def test_parts_that_do_not_fit_each_other(tmp_path, change, said):
         load_policy(tmp_path)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0, -1.0])
+@pytest.mark.parametrize("name", [ACTION, MOMENT, WEIGHT])
+def test_a_policy_that_is_loaded_is_finite(tmp_path, name, value):
+    saved(tmp_path, network=PreconditionedNetwork(VelocityMLP(D_A, D_O, H, TO, hidden_dim=16)))
+    rewrite(tmp_path, lambda tensors, config: tensors[name].view(-1)[-1:].fill_(value))
+    if name == WEIGHT and math.isfinite(value):
+        load_policy(tmp_path)
+        return
+    with pytest.raises(ValueError, match=f"the policy at {tmp_path} .*: {name} holds"):
+        load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "option", "value"),
+    [
+        ("network", "hidden_dim", 20_000),
+        ("network", "hidden_dim", 10**9),
+        ("network", "num_blocks", 100_000),
+        ("network", "prediction_length", 10**7),
+        ("network", "observation_dim", 10**8),
+        ("normalizer", "shapes", [["observation", [10**10]], ["action", [2]]]),
+    ],
+)
+def test_nothing_large_is_built_from_options_of_a_file(tmp_path, part, option, value):
+    saved(tmp_path)
+    rewrite(tmp_path, lambda tensors, config: config[part].update({option: value}))
+    with pytest.raises(ValueError, match=f"the policy at {tmp_path} cannot be built here"), Sizes() as sizes:
+        load_policy(tmp_path)
+    # As many numbers and tensors as an actor of this size takes, with room; 20,000 squared are 4e8.
+    assert sizes.most < 2e7 and sizes.count < 10_000
+
+
+class Sizes(TorchDispatchMode):
+    """What is made while it is active."""
+
+    most, count = 0, 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor):
+            self.most, self.count = max(self.most, made.numel()), self.count + 1
+        return made
+
+
+def test_a_copy_of_the_configuration_that_differs_is_reported(tmp_path):
+    actor = saved(tmp_path)
+    copy = tmp_path / "config.json"
+    copy.write_text(copy.read_text().replace("0.125", "0.5"))
+    with pytest.warns(UserWarning, match=r"config\.json differs in prior from model\.safetensors"):
+        again = load_policy(tmp_path)
+    assert again.prior.sigma == actor.prior.sigma == 0.125
+    copy.unlink()
+    load_policy(tmp_path)
+
+
 def test_only_regular_files_are_opened(tmp_path):
     saved(tmp_path)
     (tmp_path / "model.safetensors").unlink()
@@ -217,6 +277,7 @@ def _save_in_a_loop(folder, started):
         started.set()
 
 
+@pytest.mark.filterwarnings("ignore:.*config.json differs")  # a save writes it last
 def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
     context = multiprocessing.get_context("fork")
     started = context.Event()

@@ -96,6 +96,11 @@ class Normalizer(nn.Module):
             low[key], high[key] = middle - half, middle + half
         return cls(low, high)
 
+    @property
+    def positive(self) -> list[str]:
+        """Names of the buffers that are scales."""
+        return [_name(key, "scale") for key in self.keys]
+
     def loc(self, key: NestedKey) -> Tensor:
         """Middle of the range of ``key``, ``[d]``, raw units."""
         return self.get_buffer(_name(key, "loc"))

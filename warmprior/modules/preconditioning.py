@@ -55,6 +55,7 @@ class RestingAction(nn.Module):
     scale: Tensor
     action_loc: Tensor
     action_scale: Tensor
+    positive = ("scale", "action_scale")
 
     def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
         super().__init__()
@@ -217,6 +218,7 @@ class SourceMoments(nn.Module):
     target_variance: Tensor
     covariance: Tensor
     conditional_deviation: Tensor
+    positive = ("source_variance", "target_variance", "conditional_deviation")
 
     def __init__(
         self,

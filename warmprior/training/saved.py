@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import tempfile
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
@@ -14,12 +16,14 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.preconditioning import RestingAction, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
@@ -42,10 +46,20 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         elif kept:
             reason = f"it holds the policies {', '.join(kept)}: name one of them"
         raise FileNotFoundError(f"no policy at {folder}: {reason}")
+    copy = None
     if (folder / CONFIG).is_file():
-        _check_format(folder / CONFIG, read_json(folder / CONFIG))  # earlier ones have no other place for it
+        copy = read_json(folder / CONFIG)
+        _check_format(folder / CONFIG, copy)  # earlier ones have no other place for it
     tensors, config = load_state(path, "policy", "Copy it again")
     _check_format(path, config)
+    if copy not in (None, config):
+        differ = sorted(name for name in {*copy, *config} if copy.get(name) != config.get(name))
+        # Not refused: a save that was interrupted leaves the copy of the policy before.
+        warnings.warn(
+            f"{folder / CONFIG} differs in {', '.join(differ)} from {WEIGHTS} beside it, which counts: save "
+            "the policy again",
+            stacklevel=4,
+        )
     return tensors, config
 
 
@@ -286,8 +300,9 @@ def load_policy(
 
 
 def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorActor:
-    """An actor of a configuration, with given weights."""
-    actor = _from_config(config)
+    """An actor of a configuration, with given weights, all of them finite."""
+    with _NoLargerThan(tensors):
+        actor = _from_config(config)
     built = actor.state_dict()
     for name in sorted(built.keys() ^ tensors.keys()):
         raise ValueError(f"{name} is {'missing' if name in built else 'not part of it'}")
@@ -295,8 +310,38 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
         mine, theirs = (f"{tuple(t.shape)} of {t.dtype}" for t in (value, tensors[name]))
         if mine != theirs:
             raise ValueError(f"{name} is {theirs}, not {mine}")
+        if value.is_floating_point() and not torch.isfinite(tensors[name]).all():
+            raise ValueError(f"{name} holds NaN or infinity")
     actor.load_state_dict(tensors)
+    for place, module in actor.named_modules():
+        if isinstance(module, (Normalizer, RestingAction, SourceMoments)):
+            for name in module.positive:
+                if not (module.get_buffer(name) > 0).all():
+                    raise ValueError(f"{place}.{name} holds values that are not positive, and it is a scale")
     return actor
+
+
+class _NoLargerThan(TorchDispatchMode):
+    """Stops what is built from options of a file once it is much larger than the weights beside them."""
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        # With room for what is built on the way, and for buffers that are not saved.
+        self.numbers = 2 * sum(value.numel() for value in tensors.values()) + 2**24
+        self.count = 10 * len(tensors) + 1000
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        sizes: list[Any] = []
+        if func is torch.ops.aten.clone.default:  # by which layers are copied
+            sizes = [args[0].numel()]
+        elif not any(isinstance(value, Tensor) for value in args):  # it makes one, of a size among these
+            sizes = [math.prod(value) if isinstance(value, (list, tuple)) else value for value in args]
+        if sizes:
+            self.numbers -= max((size for size in sizes if isinstance(size, int)), default=1)
+            self.count -= 1
+            if self.numbers < 0 or self.count < 0:
+                raise ValueError("its options ask for far more weights than it has")
+        return func(*args, **(kwargs or {}))
 
 
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
