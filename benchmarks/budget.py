@@ -14,12 +14,12 @@ import sys
 from dataclasses import dataclass, replace
 
 from lab.comparison import compare
-from lab.files import read_lines
 from lab.measures import held_out
 from lab.options import PRESETS, MeasuredOptions, check_given, check_single, parse, script, started, study
 from lab.plots import plot_lines
 from lab.policies import policies_of, write_rows
 from lab.report import labelled, per_seed, table, write_report
+from lab.rows import PLAYED, read_rows
 from lab.tasks import check_counts, title_of
 from warmprior.diagnostics import action_error, encoded_windows
 from warmprior.training import TrainingConfig
@@ -59,7 +59,7 @@ def main(argv: list[str] | None) -> None:
             windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
             found = action_error(actor, encoded_windows(actor, windows), nfes=nfes)
             error |= {(policy.name, nfe): value for nfe, value in found.items()}
-        played = read_lines(out / "results.jsonl")
+        played = read_rows(out / "results.jsonl", PLAYED)
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
         rows = write_rows(out / "results.jsonl", measured)
         seeds = per_seed(labelled(rows), options.evaluation.top_k)

@@ -15,7 +15,8 @@ import pandas as pd
 
 from lab.options import script
 from lab.plots import colors_of, new_figure, save
-from lab.report import read_rows, summary, table
+from lab.report import summary, table
+from lab.rows import PLAYED, read_rows
 
 
 @script("memory.py", hint="")
@@ -27,12 +28,11 @@ def main(argv: list[str] | None) -> None:
     args = parser.parse_args(argv)
 
     # A record per task, method and NFE, with everything that is known of it as a column.
-    tables = [read_rows(run / "results.jsonl") for run in args.runs]
+    whose = "robomimic.py or pusht.py: name a run of these"
+    tables = [pd.DataFrame(read_rows(run / "results.jsonl", PLAYED, whose)) for run in args.runs]
     for run, rows in zip(args.runs, tables, strict=True):
-        if missing := {"task", "memory_gain", "outcomes"} - set(rows):
-            raise ValueError(
-                f"{run}: its rows have no {sorted(missing)}; name a run of robomimic.py or pusht.py"
-            )
+        if "memory_gain" not in rows:
+            raise ValueError(f"{run}: its rows have no memory_gain; name a run of robomimic.py or pusht.py")
     found = pd.concat([summary(rows, top_k=1) for rows in tables])
     found = found[found.memory_gain.notna() & found.gain.notna()]
     if found.empty:

@@ -29,7 +29,6 @@ from lab.agents import (
     environment,
     frozen_policies,
 )
-from lab.files import read_lines
 from lab.options import (
     PRESETS,
     Evaluation,
@@ -43,6 +42,7 @@ from lab.options import (
 from lab.plots import plot_lines, plot_success
 from lab.policies import slug, write_rows
 from lab.report import labelled, problem_title, table, write_report
+from lab.rows import AGENT, read_rows
 from lab.tasks import DataOptions
 from warmprior import WarmPriorActor
 from warmprior.envs.tasks import EVALUATION_SEED
@@ -171,7 +171,7 @@ def main(argv: list[str] | None) -> None:
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
         path = out / "results.jsonl"
-        rows, failures = read_lines(path) if path.exists() else [], []
+        rows, failures = read_rows(path, AGENT) if path.exists() else [], []
         arms = [arm for method in frozen for arm in options.arms(method)]
         for seed, arm in product(options.seeds, sorted(arms, key=lambda arm: arm.algorithm)):
             actor = frozen[arm.method][seed]

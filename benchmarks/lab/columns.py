@@ -7,10 +7,7 @@ Rows are those of `results.jsonl` and `curvature.jsonl`; a table has means over 
 from __future__ import annotations
 
 # Name -> (format of its numbers, meaning).
-COLUMNS: dict[str, tuple[str, str]] = {
-    # What is compared.
-    "problem": ("", "task and style in words"),
-    "method": ("", "the source in words, with its options; sigma and H where several are compared"),
+_COMPARED: dict[str, tuple[str, str]] = {
     "task": ("", "task"),
     "data": ("", "style of the demonstrations: ph, mh, or one's own"),
     "actions": ("", "space of the actions, where it is not that of recorded deltas"),
@@ -33,6 +30,15 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "environment_steps": ("d", "control steps that the agent has learnt from"),
     "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy, stochastic: the agent"),
     "mean": ("", "history of the source: of training, or deployed, after the policy's own last decision"),
+}
+
+IDENTITY = tuple(_COMPARED)
+"""The columns that say which row it is: no two rows of a file agree in all of them."""
+
+COLUMNS: dict[str, tuple[str, str]] = {
+    "problem": ("", "task and style in words"),
+    "method": ("", "the source in words, with its options; sigma and H where several are compared"),
+    **_COMPARED,
     "observations": ("d", "observations that the measure is the mean of"),
     # Success.
     "episodes": ("d", "evaluation episodes of the last checkpoint, of all seeds in a table"),

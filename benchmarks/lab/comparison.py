@@ -11,13 +11,14 @@ from typing import Any
 
 import pandas as pd
 
-from lab.files import PartialFailure, read_lines
+from lab.files import PartialFailure
 from lab.jobs import Jobs
 from lab.leader import go_on_alone
 from lab.measures import measure
 from lab.methods import Method
 from lab.options import Evaluation, Options
 from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
+from lab.rows import PLAYED, read_rows
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import rank, world_size
 from warmprior.io.files import check_writable, write_atomic
@@ -48,25 +49,35 @@ def compare(
         write_rows(path, rows)
 
     path = options.run.folder / "results.jsonl"
-    rows = read_lines(path) if path.exists() else []
+    rows = read_rows(path, PLAYED) if path.exists() else []
     if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(
             f"{path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
             "with those, or choose another --out"
         )
+    cells = {
+        policy.name: [
+            replace(condition, checkpoint=checkpoint, nfe=nfe)
+            for checkpoint, nfe, condition in product(
+                policy.training.checkpoint_iterations,
+                policy.method.nfes(evaluation.nfe),
+                conditions(policy.method),
+            )
+        ]
+        for policy in policies
+    }
+    played = {p.name: {c: (p.facts | c.facts()).items() for c in cells[p.name]} for p in policies}
+    for number, found in enumerate(rows, 1):
+        mine = played[found["policy"]].values()
+        if found["episodes"] != evaluation.episodes or not any(facts <= found.items() for facts in mine):
+            raise ValueError(
+                f"{path}, line {number} is no row of this run: remove that line, and continue with --resume"
+            )
     failures = begin(options, policies)
     with Jobs(options.run) as jobs:
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
-            cells = [
-                replace(condition, checkpoint=checkpoint, nfe=nfe)
-                for checkpoint, nfe, condition in product(
-                    policy.training.checkpoint_iterations,
-                    policy.method.nfes(evaluation.nfe),
-                    conditions(policy.method),
-                )
-            ]
-            facts = {cell: (policy.facts | cell.facts()).items() for cell in cells}
-            missing = [cell for cell in cells if not any(facts[cell] <= row.items() for row in rows)]
+            facts = played[policy.name]
+            missing = [c for c in cells[policy.name] if not any(facts[c] <= row.items() for row in rows)]
             if str(policy) not in failures:
                 submit(jobs, policy, missing, evaluation, add)
         failures |= jobs.wait()

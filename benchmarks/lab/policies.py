@@ -28,7 +28,7 @@ from lab.leader import leader_first
 from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
-from lab.report import read_rows
+from lab.rows import read_rows
 from lab.source_errors import mean_revision
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
 from warmprior import WarmPriorActor
@@ -406,4 +406,4 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     ]
     text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in known)
     write_atomic(path, lambda path: path.write_text(text))
-    return read_rows(path)
+    return pd.DataFrame(read_rows(path))

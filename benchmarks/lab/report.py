@@ -17,10 +17,11 @@ import pandas as pd
 from pandas import DataFrame, Series
 
 from lab.columns import COLUMNS, column
-from lab.files import PartialFailure, read_lines
+from lab.files import PartialFailure
 from lab.methods import label
 from lab.options import IMAGES, Options, with_parts
 from lab.paper import paper_success
+from lab.rows import read_rows
 from lab.statistics import paired_probability_better, probability_better, top_k_mean
 from warmprior.diagnostics import success_posterior
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
@@ -37,11 +38,6 @@ SHOWN = [  # below the success rates of report.md
 
 
 # Rows
-
-
-def read_rows(path: Path) -> DataFrame:
-    """The rows of a file of JSON lines, as a table."""
-    return DataFrame(read_lines(path))
 
 
 def text_of(row: Mapping[str, Any], name: str) -> str:
@@ -352,7 +348,8 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> from lab.report import policy_results
-        >>> row = {"task": "lift", "data": "ph", "policy": "lift-ph", "checkpoint": 20, "success_rate": 0.5}
+        >>> row = {"task": "lift", "data": "ph", "policy": "lift-ph", "checkpoint": 20, "seed": 0,
+        ...        "episodes": 4, "successes": 2, "success_rate": 0.5}
         >>> with TemporaryDirectory() as folder:
         ...     _ = (Path(folder) / "results.jsonl").write_text(json.dumps(row))
         ...     policy_results(folder, "policies/lift-ph/policy_000020")[0]["success_rate"]
@@ -363,7 +360,7 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         raise FileNotFoundError(f"{run} has no results.jsonl: name the folder of a finished run")
     rows = [
         row
-        for row in read_lines(path)
+        for row in read_rows(path)
         if "success_rate" in row
         and row.get("policy") == folder.parent.name
         and f"policy_{row['checkpoint']:06d}" == folder.name

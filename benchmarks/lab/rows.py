@@ -1,0 +1,91 @@
+"""Rows of results: what is in them, checked when they are read.
+
+A row is one JSON object in a file of lines. Its columns are those of `columns.py`, of the types that their
+formats say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lab.columns import IDENTITY, column
+from lab.files import read_lines
+
+COUNTED = ("episodes", "successes", "success_rate")
+"""What every row of played episodes has."""
+
+REQUIRED = ("sigma", *COUNTED)
+"""Numbers that are never null."""
+
+METHOD = ("task", "data", "prior", "options", "sigma", "chunk", "seed", "nfe")
+
+PLAYED = (*METHOD, "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
+"""Of a policy's cell: see `policies.row`."""
+
+AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_steps", *COUNTED)
+"""Of an agent's evaluation."""
+
+
+def read_rows(
+    path: Path, needed: Sequence[str] = (), whose: str = "a run of this script"
+) -> list[dict[str, Any]]:
+    """Read rows that have the `needed` columns; a ``ValueError`` names the file and the line that is none.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from lab.rows import read_rows
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "results.jsonl"
+        ...     _ = path.write_text('{"seed": 0, "nfe": "nine"}')
+        ...     read_rows(path)
+        Traceback (most recent call last):
+            ...
+        ValueError: ...results.jsonl, line 1: nfe is 'nine', not a whole number: remove that line, ...
+    """
+    rows, seen = read_lines(path), dict[tuple[Any, ...], int]()
+    for number, row in enumerate(rows, 1):
+        try:
+            _check(row, needed, whose)
+            identity = tuple(row.get(name) for name in IDENTITY)
+            if seen.setdefault(identity, number) != number:
+                raise ValueError(f"it is line {seen[identity]} once more")
+        except ValueError as error:
+            raise ValueError(
+                f"{path}, line {number}: {error}: remove that line, and continue with --resume"
+            ) from error
+    return rows
+
+
+def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
+    if missing := [name for name in needed if name not in row]:
+        raise ValueError(f"it has no {', '.join(missing)}, so it is no row of {whose}")
+    for name, value in row.items():
+        try:
+            form = column(name)[0]
+        except KeyError:
+            raise ValueError(f"it has a column {name!r}, which there is not") from None
+        # What cannot be measured is null, and so is the seed of an average over several.
+        null = "mean" in row if name == "seed" else form not in ("", "d") and name not in REQUIRED
+        if not (_fits(value, form) or (null and value is None)):
+            words = {"": "text", "d": "a whole number"}.get(form, "a finite number")
+            raise ValueError(f"{name} is {value!r}, not {words}")
+    if any(name in row for name in COUNTED):
+        if missing := [name for name in (*COUNTED, "seed") if name not in row]:
+            raise ValueError(f"it has no {', '.join(missing)}")
+        won, played, outcomes = row["successes"], row["episodes"], row.get("outcomes")
+        if not 0 <= won <= played or played < 1 or abs(row["success_rate"] - won / played) > 1e-9:
+            raise ValueError(f"{won} successes of {played} episodes are no rate of {row['success_rate']}")
+        if outcomes is not None and sorted(outcomes) != ["0"] * (played - won) + ["1"] * won:
+            raise ValueError(f"outcomes are not those of {won} successes in {played} episodes: {outcomes!r}")
+
+
+def _fits(value: Any, form: str) -> bool:
+    """Whether a value has the type of a column's format."""
+    if form == "":
+        return isinstance(value, str)
+    number = int if form == "d" else (int, float)
+    return isinstance(value, number) and not isinstance(value, bool) and math.isfinite(value)
