@@ -398,10 +398,13 @@ def recorded(options: Options) -> dict[str, Any]:
     return tree
 
 
+_ABSENT = object()  # no option is this
+
+
 def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
     """The options in which two records differ."""
     for name in mine.keys() | theirs.keys():
-        one, two = mine.get(name), theirs.get(name)
+        one, two = mine.get(name, _ABSENT), theirs.get(name, _ABSENT)
         if isinstance(one, dict) and isinstance(two, dict):
             yield from differences(one, two)
         elif one != two:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from lab.workers import available_cores
 from warmprior.io.extras import require
@@ -124,19 +125,33 @@ def ray_cluster(
                 "address": address or "local",
                 "runtime_env": {"env_vars": {"PYTHONPATH": path}},
             }
-            if address is None:  # nobody else is to reach it
+            if address is None:
                 cores = num_cpus or available_cores()
                 options |= {"num_cpus": cores, "include_dashboard": False}
-                options["_node_ip_address"] = "127.0.0.1"
             stop_forking()  # a connection does not survive it
             stack.callback(ray.shutdown)
-            ray.init(**options, logging_level="ERROR")
+            with _unreachable() if address is None else contextlib.nullcontext():
+                ray.init(**options, logging_level="ERROR")
         with _tokens(folders) as tokens:
             nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
             looks = [_look_at(ray, node, tokens) for node in nodes]  # all at once: each takes seconds
             for node, look in zip(nodes, looks, strict=True):
                 _check_node(ray, node, look)
         yield ray
+
+
+@contextlib.contextmanager
+def _unreachable() -> Iterator[None]:
+    """Let Ray's processes, which run what they are sent, listen on this machine's loopback alone.
+
+    It does so by itself where it supports no clusters, and turns any loopback address that it is given into
+    one that others reach.
+    """
+    from ray._private import ray_constants
+
+    local = {ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR: "0"}  # for the processes that it starts
+    with mock.patch.dict(os.environ, local), mock.patch.object(ray_constants, "ENABLE_RAY_CLUSTER", False):
+        yield
 
 
 def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> Any:

@@ -19,6 +19,7 @@ from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, digest_of, exclusive, file_digest, write_atomic
+from warmprior.io.machine import available_memory
 
 
 def render_demonstrations(
@@ -78,6 +79,12 @@ def render_demonstrations(
     for name, value in {"size": size, "workers": workers}.items():
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    needed, free = 3 * size**2 * max(index.lengths) * len(cameras), available_memory()
+    if needed > free:
+        raise ValueError(
+            f"size {size} is too large: the images of a demonstration need {needed / 1e9:.1f} GB of memory, "
+            f"and {free / 1e9:.1f} GB are free"
+        )
     kept = _rendered_before(path, index, cameras, fast)
     chosen = [] if demos is None else [demos]
     identity = digest_of(*renderer_versions(), file_digest(path), cameras, size, fast, *chosen)[:8]

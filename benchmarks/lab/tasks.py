@@ -36,18 +36,24 @@ GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
 
 
+MOST = 10_000_000
+"""Of anything that is counted: more could neither be listed nor done."""
+
+
 def is_simulated(task: str) -> bool:
     """Whether a task is one of robosuite: not the toy, and not one of a user's own."""
     return task != "navigation" and ":" not in task
 
 
 def check_counts(options: Any, *names: str) -> None:
-    """Refuse options of a dataclass that are no whole numbers of at least 1; ``None`` is fine."""
+    """Refuse options of a dataclass that are no whole numbers from 1 to MOST; ``None`` is fine."""
     for name in names:
-        value = getattr(options, name)
+        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         for count in value if isinstance(value, tuple) else (value,):
             if count is not None:
-                check_whole_numbers(**{f"--{name.replace('_', '-')}": count})
+                check_whole_numbers(**{option: count})
+                if count > MOST:
+                    raise ValueError(f"{option} must be at most {MOST:,}, got {count}")
 
 
 def check_place(place: str | Path, option: str) -> None:

@@ -99,6 +99,32 @@ def test_a_run_continues_with_its_options_and_refuses_others(tmp_path, monkeypat
             stored_options(Options, out, None)
 
 
+def test_an_option_that_a_file_lacks_is_no_default(tmp_path):
+    """Without `dataset` a run would generate demonstrations of its own, for minutes."""
+    file = tmp_path / "file.hdf5"
+    file.touch()
+    path = tmp_path / "out" / "options.json"
+    path.parent.mkdir()
+    record = {"study": "a-study", "options": recorded(read("--dataset", file, out=path.parent))}
+    path.write_text(json.dumps(record))
+    stored_options(Options, path.parent, "a-study")
+    for part, values in record["options"].items():
+        for name in values:
+            damaged = copy.deepcopy(record)
+            del damaged["options"][part][name]
+            path.write_text(json.dumps(damaged))
+            with pytest.raises(ValueError, match=rf"options\.json .*--{name.replace('_', '-')}"):
+                stored_options(Options, path.parent, "a-study")
+
+
+@pytest.mark.parametrize(
+    "option", ["demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "envs"]
+)
+def test_counts_that_could_not_be_listed(tmp_path, option):
+    with pytest.raises(ValueError, match=rf"--{option} must be at most 10,000,000, got {10**23}"):
+        read(f"--{option}", 10**23, out=tmp_path)
+
+
 def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
     """Its policies can be measured here; a training needs the device."""
     with started(read(out=tmp_path), "a-study"):

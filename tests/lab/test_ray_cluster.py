@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import sys
 import time
@@ -28,6 +29,25 @@ def test_machines_look_for_modules_where_this_process_does(ray_address, tmp_path
             assert same is ray
         assert ray.is_initialized()
     assert not ray.is_initialized() and not list(tmp_path.glob(".shared-*"))
+
+
+@pytest.mark.slow
+@apart
+def test_a_cluster_of_this_machine_alone_is_reached_from_no_other(monkeypatch):
+    import psutil
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with ray_cluster(num_cpus=1) as ray:
+        assert ray.get(ray.remote(lambda: 42).remote()) == 42
+        me = psutil.Process()
+        listening = {}
+        for process in (me, *me.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                for socket_ in process.net_connections(kind="inet"):
+                    if socket_.status == psutil.CONN_LISTEN:
+                        listening[socket_.laddr.port] = socket_.laddr.ip.removeprefix("::ffff:")
+    assert len(listening) >= 4, "where are the head, the node, this process and a worker?"
+    assert set(listening.values()) <= {"127.0.0.1", "::1"}
 
 
 def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):

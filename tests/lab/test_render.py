@@ -46,6 +46,7 @@ def recorded(lift_demonstrations, tmp_path_factory):
     shutil.copy(lift_demonstrations, path)
     with h5py.File(path, "a") as file:
         del file["data/demo_2"]
+        file["data"].attrs["total"] = 2 * STEPS
         for name, names in list(file["mask"].items()):
             kept = [demo for demo in names[()] if demo != b"demo_2"]
             del file["mask"][name]
@@ -171,6 +172,12 @@ def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
     for key in IMAGES:
         assert (images[f"demo_0/{key}"] == 7).all(), "a finished demo was rendered again"
         np.testing.assert_array_equal(images[f"demo_1/{key}"], expected[f"demo_1/{key}"])
+
+
+def test_images_beyond_any_memory_are_refused(copy):
+    with pytest.raises(ValueError, match="size 1000000000 is too large"):
+        render_demonstrations(copy, CAMERAS, 10**9)
+    assert not list(copy.parent.glob("*.hdf5.*"))
 
 
 def of_another_environment(file):

@@ -131,6 +131,7 @@ def in_threads(count, state):
         ("tool_hang", {}, "no scripted expert for 'tool_hang'.*download_robomimic"),
         ("lift", {"style": "mg"}, "style is 'ph' or 'mh', got 'mg'"),
         ("lift", {"seed": 100}, "seed must be between 0 and 99, got 100"),
+        ("lift", {"n": 10**23}, "n must be at most 100,000"),
     ],
 )
 def test_bad_arguments(task, options, message, tmp_path, monkeypatch):

@@ -87,6 +87,8 @@ def generate_demonstrations(
     for name, value in {"n": n, "workers": workers}.items():
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    if n > SEEDS_PER_FILE:
+        raise ValueError(f"n must be at most {SEEDS_PER_FILE:,}, the seeds of a file, got {n}")
     if path is None:
         name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
         path = cache_folder() / "scripted" / name
