@@ -76,6 +76,30 @@ def renamed(options):
     return replace(task(options), name="Drift 2")
 
 
+class Broken(DriftEnv):
+    """Built and reset like the other, and no further."""
+
+    def _step(self, tensordict):
+        raise RuntimeError("a cable is loose")
+
+
+def mute(options):
+    """With an environment that does not say whether it is solved."""
+    return replace(task(options), success="won")
+
+
+def narrow(options):
+    """With demonstrations of other observations."""
+    data = demonstrations()
+    data["observation"] = data["observation"][:, 1:]
+    return Task.of("drift", data, DriftEnv, style="own", success="solved")
+
+
+def broken(options):
+    """With an environment that fails once it is played."""
+    return replace(task(options), make_env=Broken)
+
+
 class Widening(PastPrior, torch.nn.Module):
     """A source whose noise is learnt with the flow."""
 

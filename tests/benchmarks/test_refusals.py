@@ -7,6 +7,8 @@ import importlib
 import pytest
 
 from tests.benchmarks.script_parts import refused
+from tests.data.synthetic import env_args_15, write_robomimic_file
+from warmprior.envs import modernize_env_args
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -74,3 +76,50 @@ def test_what_cannot_work_is_refused_before_any_work(
     argv = [*words.format(file=dataset, tmp=tmp_path).split(), "--out", tmp_path / "out"]
     assert message in refused(importlib.import_module(script).main, argv, capsys)
     assert not list(tmp_path.glob("policies/*")) and not list(tmp_path.glob("out/*"))
+
+
+def _unregistered(env_args):
+    env_args["env_name"] = "Own"
+
+
+def _another_name(env_args):
+    env_args["env_kwargs"]["env_name"] = "Door"
+
+
+def _unknown_option(env_args):
+    env_args["env_kwargs"]["tusk"] = 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(_unregistered, "'Own'"), (_another_name, "'Door'"), (_unknown_option, "tusk")],
+)
+@pytest.mark.parametrize("script", ["robomimic", "prior_space_rl"])
+def test_an_environment_that_cannot_be_built_is_refused_before_training(
+    script, change, said, no_work, tmp_path, capsys
+):
+    env_args = env_args_15("lift")
+    change(env_args)
+    path = tmp_path / "own.hdf5"
+    write_robomimic_file(path, lengths=(30, 20), task="lift", env_args=env_args)
+    argv = ["--dataset", path, "--nfe", 1, "--prior", "past", "--out", tmp_path / "out"]
+    line = refused(importlib.import_module(script).main, argv, capsys)
+    assert said in line and "own.hdf5" in line
+    assert not list(tmp_path.glob("policies/*"))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("mute", "'won'"), ("narrow", "'observation'"), ("broken", "a cable is loose")]
+)
+def test_an_environment_of_ones_own_is_played_before_training(name, said, no_work, tmp_path, capsys):
+    argv = ["--task", f"tests.benchmarks.drift:{name}", "--prior", "past", "--chunk", 4, "--nfe", 1]
+    line = refused(importlib.import_module("robomimic").main, [*argv, "--out", tmp_path / "out"], capsys)
+    assert said in line and "drift" in line
+    assert not list(tmp_path.glob("policies/*")) and not list(tmp_path.glob("out/*"))
+
+
+def test_the_name_of_the_environment_among_its_options(tmp_path):
+    """Some writers repeat it there, and robosuite would be given it twice."""
+    env_args = env_args_15("lift")
+    env_args["env_kwargs"]["env_name"] = "Lift"
+    assert modernize_env_args(env_args) == modernize_env_args(env_args_15("lift"))

@@ -1,8 +1,9 @@
-"""Files to damage, and the ways to do so: demonstrations, policies and training states."""
+"""Files to damage, and the ways to do so: demonstrations, policies, training states and results."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from lab.options import PRESETS, Options, recorded, stored_options, with_parts
+from lab.rows import PLAYED, read_rows
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.sandbox import Outcome
 from tests.training.cloning_parts import CONFIG, training
@@ -24,9 +27,10 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.data import RobomimicDemonstrations
+from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
 from warmprior.envs import modernize_env_args
-from warmprior.training.checkpoint import load_state, module_tensors, named, snapshot_optimizer
+from warmprior.history import cold_history
+from warmprior.training.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.training.saved import load_policy, policy_config, save_policy
 
 Case = tuple[str, Callable[[], Outcome], str]
@@ -271,6 +275,121 @@ def _says_so(path: Path, replay: RobomimicDemonstrations, options: dict) -> bool
     return equal and replay.env_args == modernize_env_args(meta)
 
 
+# --- LeRobotDatasets
+
+
+def make_datasets(folder: Path) -> None:
+    """Convert demonstrations; the folder of cases is theirs with one file in it replaced."""
+    path = folder / "lift.hdf5"
+    write_robomimic_file(path, lengths=(6, 9), task="lift", masks={"train": [0]})
+    convert_robomimic(path, folder / "whole")
+
+
+def mutate_datasets(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage a file of a dataset: its bytes, or, where it is JSON, also an entry."""
+    whole, case = folder / "whole", folder / "case"
+    shutil.rmtree(case, ignore_errors=True)
+    shutil.copytree(whole, case)
+    # What LeRobot's own statistics and tasks are is read by nobody here.
+    files = sorted(
+        p for p in case.rglob("*") if p.is_file() and p.name not in ("stats.json", "tasks.parquet")
+    )
+    path = files[int(rng.integers(len(files)))]
+    if path.suffix == ".json" and rng.random() < 0.7:
+        content = json.loads(path.read_text())
+        how = odd_json(content, rng)
+        path.write_text(json.dumps(content))
+    else:
+        how = damage(path, rng)
+    options = {"filter_key": "train" if rng.random() < 0.3 else None, "absolute_actions": rng.random() < 0.3}
+
+    def load() -> Outcome:
+        replay, expected = (LeRobotDemonstrations(place, **options) for place in (case, whole))
+        same = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
+        if same and replay.env_args == expected.env_args:
+            return Outcome("equal")
+        # JSON keeps no checksum: another environment, of the same task, is another recording's.
+        same_task = replay.task == expected.task and same
+        return Outcome("as stored") if same_task and path.suffix == ".json" else Outcome("silent", "differs")
+
+    return f"{path.relative_to(case)} {how}", load, str(case)
+
+
+# --- results, and the options of a run
+
+ROW = {
+    **{"task": "lift", "data": "ph", "prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0},
+    **{"iterations": 30, "policy": "lift-ph-past-seed0", "checkpoint": 30, "nfe": 9, "mean_steps": 31.5},
+    **{"episodes": 4, "successes": 3, "success_rate": 0.75, "outcomes": "1011", "kappa": None},
+}
+
+
+def make_rows(folder: Path) -> None:
+    """Write rows of a few cells."""
+    rows = [ROW | {"seed": seed, "nfe": nfe, "policy": f"past-{seed}"} for seed in (0, 1) for nfe in (9, 1)]
+    (folder / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def mutate_rows(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage a file of rows."""
+    whole, path = folder / "results.jsonl", folder / "case.jsonl"
+    rows = [json.loads(line) for line in whole.read_text().splitlines()]
+    if rng.random() < 0.7:
+        how = odd_json(rows, rng)
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    elif rng.random() < 0.3:
+        how = "a row twice"
+        path.write_text("".join(json.dumps(row) + "\n" for row in [*rows, rows[int(rng.integers(4))]]))
+    else:
+        path.write_bytes(whole.read_bytes())
+        how = damage(path, rng)
+
+    def load() -> Outcome:
+        found, expected = read_rows(path, PLAYED), read_rows(whole, PLAYED)
+        if found == expected:
+            return Outcome("equal")
+        # A row less, which is computed again, or another number of one that could be.
+        texts = [json.loads(line) for line in path.read_text().splitlines()]
+        return Outcome("as stored") if found == texts else Outcome("silent", "differs")
+
+    return how, load, str(path)
+
+
+def make_options(folder: Path) -> None:
+    """Write the options of a run on a file of demonstrations."""
+    (folder / "case").mkdir()
+    path = folder / "lift.hdf5"
+    path.touch()
+    options = with_parts(PRESETS["quick"], data={"dataset": path, "task": ("lift",), "demonstrations": ()})
+    record = {"study": "robomimic", "options": recorded(options)}
+    (folder / "options.json").write_text(json.dumps(record, indent=1))
+
+
+def mutate_options(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage options of a run."""
+    whole, path = folder / "options.json", folder / "case" / "options.json"
+    path.write_bytes(whole.read_bytes())
+    if rng.random() < 0.7:
+        content = json.loads(whole.read_text())
+        how = odd_json(content, rng)
+        path.write_text(json.dumps(content))
+    else:
+        how = damage(path, rng)
+
+    def load() -> Outcome:
+        options = stored_options(Options, path.parent, "robomimic")
+        try:
+            options.check()
+        except (ValueError, OSError) as error:  # which names the option
+            return Outcome("refused" if "--" in str(error) else "unclear", str(error))
+        tree = json.loads(path.read_bytes())["options"]
+        same = tree == json.loads(whole.read_text())["options"]
+        found = recorded(options) == tree
+        return Outcome("equal" if same else "as stored") if found else Outcome("silent", "differs")
+
+    return how, load, str(path)
+
+
 # --- saved policies and training states
 
 
@@ -300,12 +419,20 @@ def damaged_copy(whole: Path, case: Path, rng: np.random.Generator) -> str:
 
 
 def mutate_policies(folder: Path, rng: np.random.Generator) -> Case:
-    """Damage a policy."""
+    """Damage a policy; or sign another one, as anybody can who writes files."""
     whole, case = folder / str(rng.choice(["mlp", "chi"])), folder / "case"
-    how = damaged_copy(whole / "model.safetensors", case, rng)
+    signed = bool(rng.random() < 0.5)
+    if signed:
+        tensors, config = load_state(whole / "model.safetensors")
+        how = "signed: " + (odd_json(config, rng) if rng.random() < 0.7 else _odd_tensor(tensors, rng))
+        save_state(case / "model.safetensors", tensors, config)
+    else:
+        how = damaged_copy(whole / "model.safetensors", case, rng)
 
     def load() -> Outcome:
         actor, expected = load_policy(case), load_policy(whole)
+        if signed:
+            return _plays(actor)
         state, theirs = actor.state_dict(), expected.state_dict()
         same = state.keys() == theirs.keys() and all(torch.equal(state[n], theirs[n]) for n in state)
         if same and policy_config(actor) == policy_config(expected):
@@ -313,6 +440,32 @@ def mutate_policies(folder: Path, rng: np.random.Generator) -> Case:
         return Outcome("silent", "differs")
 
     return how, load, str(case)
+
+
+def _odd_tensor(tensors: dict[str, torch.Tensor], rng: np.random.Generator) -> str:
+    """Replace a value, or a tensor, in place; returns how."""
+    name = str(rng.choice(sorted(tensors)))
+    value = float(rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 1e30]))
+    if rng.random() < 0.3:
+        tensors[name] = tensors[name].flatten()[:-1].clone()
+        return f"{name} cut"
+    flat = tensors[name].view(-1)
+    if not flat.is_floating_point():
+        value = -1
+    flat[int(rng.integers(len(flat)))] = value
+    return f"{name} = {value}"
+
+
+def _plays(actor: WarmPriorActor) -> Outcome:
+    """Whether a policy that was loaded makes a decision, and of numbers."""
+    observation = torch.zeros(1, 2, 5)
+    data = TensorDict({actor.observation_key: observation}, [1])
+    lengths = actor.prior.history_length, actor.prior.prediction_length
+    data.set(actor.history_key, cold_history([1], *lengths, 2))
+    with torch.no_grad():
+        chunk = actor(data, nfe=1)[actor.tensor_keys["chunk_key"]]
+    good = bool(torch.isfinite(chunk).all()) and chunk.shape == (1, actor.prior.prediction_length, 2)
+    return Outcome("as stored") if good else Outcome("silent", f"{chunk.shape}, or not finite")
 
 
 def mutate_states(folder: Path, rng: np.random.Generator) -> Case:
@@ -357,4 +510,7 @@ SUBJECTS = (
     Subject("demonstration files", make_demonstrations, mutate_demonstrations),
     Subject("saved policies", make_policies, mutate_policies),
     Subject("training states", make_states, mutate_states),
+    Subject("results", make_rows, mutate_rows),
+    Subject("options", make_options, mutate_options),
+    Subject("LeRobotDatasets", make_datasets, mutate_datasets),
 )

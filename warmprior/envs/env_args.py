@@ -56,7 +56,7 @@ def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
         A deep copy, from which ``robosuite.make(new["env_name"], **new["env_kwargs"])`` works.
 
     Raises:
-        ValueError: if ``env_name`` or ``env_kwargs`` is missing.
+        ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``env_kwargs`` names another environment.
 
     Examples:
         >>> from warmprior.envs import modernize_env_args
@@ -71,6 +71,11 @@ def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"env_args lacks {sorted(missing)}; it has {sorted(env_args)}")
     new = copy.deepcopy(dict(env_args))
     kwargs = new["env_kwargs"]
+    if kwargs.pop("env_name", new["env_name"]) != new["env_name"]:
+        raise ValueError(
+            f"env_args name two environments: env_name is {new['env_name']!r}, and in env_kwargs "
+            f"{env_args['env_kwargs']['env_name']!r}"
+        )
     configs = kwargs.get("controller_configs")
     if configs:
         listed = configs if isinstance(configs, list) else [configs]

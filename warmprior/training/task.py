@@ -20,6 +20,7 @@ from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.preconditioning import RestingAction
+from warmprior.modules.prior import Prior
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
 
@@ -225,7 +226,7 @@ class Task:
 
     def env(
         self,
-        policy: WarmPriorActor,
+        policy: WarmPriorActor | Prior,
         base: EnvBase | None = None,
         *,
         execute: int | None = None,
@@ -235,7 +236,7 @@ class Task:
         """The environment as a policy is played in it: ``base``, or what ``make_env(**options)`` builds.
 
         Args:
-            policy: the policy.
+            policy: the policy, or its prior.
             base: an environment of the task.
 
         Keyword Args:
