@@ -151,9 +151,9 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def check_environment(task: Task, evaluation: Evaluation) -> None:
     """Build the environment of a task, reset it and step once; a ``ValueError`` if that does not work."""
-    env = None
+    env: EnvBase | None = None
     try:
-        base = task.make_env(**evaluation.environment)
+        env = base = task.make_env(**evaluation.environment)
         env = task.env(GaussianPrior(1), base)
         known = list(base.observation_spec.keys(True, True))
         for key in (task.success, *task.measures):

@@ -157,6 +157,13 @@ def test_what_rewards_do_not_say_is_not_written(tmp_path, rewards):
     assert not equal(mine, RobomimicDemonstrations(path).data)
 
 
+def test_a_mask_that_names_no_episode(converted, tmp_path):
+    path, _ = converted
+    folder = convert_robomimic(path, tmp_path / "out", demos=1)  # the mask valid is of the second
+    with pytest.raises(DatasetError, match=r"out: no demonstrations .*mask"):
+        LeRobotDemonstrations(folder, filter_key="valid")
+
+
 def test_what_cannot_be_converted(tmp_path):
     path, folder = tmp_path / "lift.hdf5", tmp_path / "out"
     with pytest.raises(FileNotFoundError, match="no such file"):

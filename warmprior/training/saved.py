@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -348,8 +349,8 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     """An actor with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
     for name, value in options.items():
-        if name.endswith("_key") and isinstance(value, list):  # a nested key, as JSON holds it
-            options[name] = tuple(value)
+        if name.endswith("_key"):
+            options[name] = _key(value)
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]
@@ -368,6 +369,14 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
         if _dtype(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
+
+
+def _key(value: Any) -> NestedKey:
+    """A key of tensordicts, of which JSON holds nested ones as lists."""
+    parts = value if isinstance(value, list) else [value]
+    if not parts or not all(isinstance(part, str) for part in parts):
+        raise ValueError(f"{value!r} is no key")
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _dtype(part: nn.Module) -> torch.dtype | None:
