@@ -446,7 +446,7 @@ def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O
     theirs = stored.get("study")
     if study not in (None, theirs):
         raise ValueError(
-            f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
+            f"{path} holds a run of {theirs}: continue it with that script, or choose another --out"
         )
     tree: Any = stored.get("options")
     if study is None and isinstance(tree, dict):

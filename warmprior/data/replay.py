@@ -294,8 +294,11 @@ def _read_absolute(
 def solved(reward: Tensor, env_args: Mapping[str, Any]) -> Tensor:
     """Where a reward says that the task is solved, bool: where it is robosuite's ``reward_scale``.
 
-    Shaped rewards are positive before that. Where the scale is ``None`` they do not say it.
+    Shaped rewards are positive before that. Where the scale is ``None`` they do not say it, and of an unknown
+    environment any that is positive does.
     """
+    if not env_args:
+        return reward > 0
     scale = env_args.get("env_kwargs", {}).get("reward_scale", 1.0)
     return reward >= (np.inf if scale is None else scale * (1 - 1e-6))
 
