@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.12 || command -v python3 || command -v python)
 BIN := .venv/bin
 ARGS ?=
-EXTRAS := sim,vision,lerobot,vla,ray,docs,dev
+EXTRAS := sim,vision,lerobot,vla,minari,ray,docs,dev
 PLUGIN := plugins/lerobot_policy_warmprior
 
 # GR00T N1.5 is in lerobot 0.5.1 alone, which needs an environment of its own.

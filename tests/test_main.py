@@ -34,7 +34,7 @@ def saved(tmp_path_factory):
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
-    task, prior = Task.from_file(path), PastPrior(8)
+    task, prior = Task.open(path), PastPrior(8)
     network = NetworkOptions(hidden_dim=16)
     actor = train_policy(task, prior, folder / "policy", network=network, training=training, description=None)
     env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
@@ -115,7 +115,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
     save_policy(WarmPriorActor(network, PastPrior(8)), bare)
     for argv, message in (
         (["evaluate", str(tmp_path / "missing")], "no policy at"),
-        (["evaluate", str(bare)], "keeps no description of a robosuite environment"),
+        (["evaluate", str(bare)], "keeps no description of an environment"),
         (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
         (["evaluate", str(saved[0]), "--grid", "sparse"], "unknown grid 'sparse'"),
         (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
@@ -134,7 +134,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
 def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     path, out = tmp_path / "lift.hdf5", tmp_path / "out"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
-    argv = ["train", "--dataset", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
+    argv = ["train", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
     small = [*argv, "--iterations", "2", "--prior", "past,correlation=0.5,sigma=0.3"]
     assert main(small) == 0
     folder = capsys.readouterr().out.splitlines()[-1]
@@ -150,7 +150,7 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     ("words", "message"),
     [
         ("--prior nobodys", "unknown prior 'nobodys'"),
-        ("--dataset missing.hdf5", "missing.hdf5: no such file"),
+        ("missing.hdf5", "missing.hdf5: no such file"),
         ("--chunk 0", "chunk_length"),
     ],
 )
@@ -167,9 +167,9 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
 
     features = {name: numbers(width) for name, width in {"arm": 3, "cup": 2, "action": 4}.items()}
     write_lerobot(tmp_path / "cups", (12, 12), features)
-    words = f"train --dataset lerobot:{tmp_path / 'cups'} --observation-keys arm cup --iterations 2"
+    words = f"train lerobot:{tmp_path / 'cups'} --observation-keys arm cup --iterations 2"
     assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
-    actor = load_policy(capsys.readouterr().out.strip())
+    actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
     assert "2 demonstrations, fewer than demos=3" in capsys.readouterr().err

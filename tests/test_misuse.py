@@ -63,7 +63,7 @@ def test_a_training_is_of_its_units(tmp_path):
 @pytest.mark.parametrize(
     ("data", "prior", "error", "said"),
     [
-        ({"action": 1}, PRIOR, TypeError, "takes a TensorDict of steps or a Task, got dict"),
+        ({"action": 1}, PRIOR, TypeError, "got dict"),
         (TensorDict(dict(steps().items()), []), PRIOR, ValueError, "must be flat steps"),
         (steps(), PastPrior, TypeError, "an object such as PastPrior"),
         (steps().exclude("episode"), PRIOR, KeyError, r"missing: .'episode'"),

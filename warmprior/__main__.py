@@ -5,18 +5,23 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+from tensordict import TensorDict, TensorDictBase
+
 from warmprior.io.script import ERRORS, run_script
+from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.transforms.window import window_transforms
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -58,7 +63,7 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
     actor = _policy(args)
-    nfe = actor.sampling.evaluations(args.nfe)
+    nfes = [actor.sampling.evaluations(nfe) for nfe in args.nfe or [None]]
     if args.grid is not None:
         actor = actor.replace(grid=args.grid)
     if args.video is not None:  # known now rather than after the episodes
@@ -66,29 +71,31 @@ def evaluate(args: argparse.Namespace) -> None:
     options = {"terminate_on_success": not args.play_on}
     env = environment_of(actor, **options)
     try:
-        episodes = play(
-            actor,
-            env,
-            episodes=args.episodes,
-            first_seed=args.first_seed,
-            nfe=nfe,
-            policy_seed=args.policy_seed,
-            description=f"NFE {nfe}",
-        )
+        for nfe in nfes:
+            episodes = play(
+                actor,
+                env,
+                episodes=args.episodes,
+                first_seed=args.first_seed,
+                nfe=nfe,
+                policy_seed=args.policy_seed,
+                description=f"NFE {nfe}",
+            )
+            wins = sum(episode.success for episode in episodes)
+            low, high = success_posterior(wins, len(episodes)).interval(0.95)
+            steps = sum(episode.steps for episode in episodes) / len(episodes)
+            print(
+                f"NFE {nfe}: {wins} of {len(episodes)} episodes solved ({100 * wins / len(episodes):.1f}%; "
+                f"95% of the posterior between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control "
+                "steps on average"
+            )
     finally:
         env.close()
-    wins = sum(episode.success for episode in episodes)
-    low, high = success_posterior(wins, len(episodes)).interval(0.95)
-    steps = sum(episode.steps for episode in episodes) / len(episodes)
-    print(
-        f"{wins} of {len(episodes)} episodes solved ({100 * wins / len(episodes):.1f}%; 95% of the posterior "
-        f"between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control steps on average"
-    )
     if args.video is not None:
         film = record_filmstrip(
             actor,
             seed=args.first_seed,
-            nfe=nfe,
+            nfe=nfes[-1],
             policy_seed=args.policy_seed,
             frames=1,
             size=256,
@@ -123,40 +130,47 @@ def push(args: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy on demonstrations, and play nothing.
+    """Train a policy on demonstrations: python -m warmprior train PLACE [OPTIONS].
+
+    PLACE is a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME.
 
     Attributes:
-        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
         network: the velocity network.
         training: the recipe.
         prior: its source (gaussian, past, preview, or package.module:Class of your own); options follow as in
             past,sigma=0.3.
         chunk: chunk length H.
-        task: of robosuite, for a LeRobotDataset that does not describe its environment.
-        style: of the demonstrations, which decides robosuite's time limit.
+        nfe: network evaluations per chunk, saved with the policy.
         observation_keys: what policies see, in this order (default: the task's).
-        cameras: whose images they see, beside the robot's state.
-        fast_rendering: whether the images are without reflections, shadows and smooth edges.
-        actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
+        image_keys: images that they see, beside the robot's state, such as agentview_image.
+        fast_rendering: whether robosuite's images are without reflections, shadows and smooth edges.
+        actions: what policies predict: as recorded, or the absolute poses that robosuite's deltas ask for.
         mask: a mask of the file, such as train.
         demonstrations: how many, from the first on (default: all).
+        held_out: how many of the last ones to leave out, and to measure the error of actions on (default: a
+            tenth where no environment is known, none elsewhere).
+        task: of robosuite, for a LeRobotDataset that does not describe its environment.
+        style: of the demonstrations, which decides robosuite's time limit (default: ph, and human elsewhere).
+        horizon: control steps per episode of a Minari dataset's environment (default: its own).
         out: folder of the trainings (default: policies); an interrupted one continues.
         device: of the network, such as cuda.
     """
 
     network: NetworkOptions
     training: TrainingConfig
-    dataset: str = ""
     prior: str = "past"
     chunk: int = 8
-    task: str | None = None
-    style: str = "ph"
+    nfe: int = 9
     observation_keys: tuple[str, ...] | None = None
-    cameras: tuple[str, ...] = ()
+    image_keys: tuple[str, ...] = ()
     fast_rendering: bool = False
     actions: Literal["delta", "absolute"] = "delta"
     mask: str | None = None
     demonstrations: int | None = None
+    held_out: int | None = None
+    task: str | None = None
+    style: str | None = None
+    horizon: int | None = None
     out: Path | None = None
     device: str = "cpu"
 
@@ -165,41 +179,69 @@ def train(args: argparse.Namespace) -> None:
     """Train a policy on demonstrations, and play nothing."""
     import tyro
 
+    place, *rest = args.options or [""]
+    if not place or place.startswith("-"):
+        place, rest = "", args.options
     options = tyro.cli(
         tyro.conf.OmitArgPrefixes[Train],
-        prog="python -m warmprior train",
-        description=train.__doc__,
-        args=args.options,
+        prog="python -m warmprior train PLACE",
+        args=rest,
         default=Train(NetworkOptions(), TrainingConfig()),
     )
     prior = make(Prior, options.prior, options.chunk)
-    if not options.dataset:
-        raise ValueError("name the demonstrations: --dataset FILE, lerobot:FOLDER or lerobot:USER/NAME")
-    task = Task.from_file(
-        options.dataset,
+    if not place:
+        raise ValueError(
+            "name the demonstrations first: train FILE.hdf5, lerobot:FOLDER, lerobot:USER/NAME or minari:NAME"
+        )
+    whole = Task.open(
+        place,
         task=options.task,
         style=options.style,
         observation_steps=options.network.observation_steps,
         actions=options.actions,
         observation_keys=options.observation_keys,
-        cameras=options.cameras,
+        image_keys=options.image_keys,
         fast_rendering=options.fast_rendering,
         mask=options.mask,
         demos=options.demonstrations,
+        horizon=options.horizon,
     )
+    count = whole.facts["demonstrations"]
+    tenth = count // 10 if whole.environment is None else 0
+    task, left_out = whole.split(tenth if options.held_out is None else options.held_out)
     source = ",".join([prior.name, *options.prior.split(",")[1:]])
     name = f"{task.name}-{task.style}-{source}-seed{options.training.seed}"
     folder = (options.out or Path("policies")) / name
-    train_policy(
+    actor = train_policy(
         task,
         prior,
         folder,
+        nfe=options.nfe,
         network=options.network,
         training=options.training,
         device=options.device,
         description=name,
     )
-    print(policy_path(folder, options.training.iterations))
+    saved = policy_path(folder, options.training.iterations)
+    if left_out is not None:
+        print(f"on the {count - task.facts['demonstrations']} demonstrations that were left out:")
+        for nfe, error in errors_of(actor, left_out, (1, 3, 9, options.nfe)).items():
+            print(f"  NFE {nfe}: mean squared error of actions {error:.4f} (they range from -1 to 1)")
+    if whole.environment is not None:
+        print(f"play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
+    print(saved)
+
+
+def errors_of(actor: WarmPriorActor, steps: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:
+    """Errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
+    from warmprior.diagnostics import action_error, encoded_windows
+    from warmprior.modules.network import uncompiled
+
+    observed = getattr(uncompiled(actor.network), "observation_steps", 2)
+    windows = window_transforms(steps, actor.prior, observation_steps=observed)
+    frames = torch.linspace(0, len(steps) - 1, min(len(steps), 4096)).round().long()
+    batch = encoded_windows(actor, windows(TensorDict({FRAME: frames}, [len(frames)])))
+    return action_error(actor, batch, nfes=nfes)
 
 
 def convert(args: argparse.Namespace) -> None:
@@ -247,7 +289,12 @@ def make_parser() -> argparse.ArgumentParser:
     from warmprior.envs.tasks import EVALUATION_SEED
 
     add("--episodes", type=int, default=50, help="how many (%(default)s)")
-    add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
+    add(
+        "--nfe",
+        type=int,
+        nargs="+",
+        help="network evaluations per chunk, one or several (default: the policy's)",
+    )
     add("--grid", help="uniform, dense-jump or dense-jump:TIME (default: the policy's)")
     add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
     add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")

@@ -19,7 +19,7 @@ from lab.scripted.tasks import EXPERTS
 from warmprior.checks import check_whole_numbers
 from warmprior.data.images import renderer_versions
 from warmprior.data.lerobot_index import is_remote
-from warmprior.data.opening import LEROBOT, lerobot_name
+from warmprior.data.opening import LEROBOT, MINARI, dataset_name
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
 from warmprior.envs.rendering import require_rendering
@@ -59,7 +59,8 @@ def check_counts(options: Any, *names: str) -> None:
 def check_place(place: str | Path, option: str) -> None:
     """Refuse a place where there can be no demonstrations; nothing is read or fetched.
 
-    A place is an HDF5 file, or ``lerobot:`` and a folder or repository; errors name it by the option.
+    A place is an HDF5 file, ``lerobot:`` and a folder or repository, or ``minari:`` and a name; errors name
+    it by the option.
 
     Examples:
         >>> from lab.tasks import check_place
@@ -69,7 +70,10 @@ def check_place(place: str | Path, option: str) -> None:
             ...
         FileNotFoundError: --dataset lerobot:./square: no such folder, and no repository user/name of the hub
     """
-    dataset = lerobot_name(place)
+    if dataset_name(place, MINARI) is not None:
+        require("minari", "minari")
+        return
+    dataset = dataset_name(place, LEROBOT)
     if dataset is None:
         if not Path(place).is_file():
             folder = (Path(place) / "meta" / "info.json").is_file()
@@ -83,7 +87,9 @@ def check_place(place: str | Path, option: str) -> None:
 
 def resolved_place(place: Path) -> str:
     """The same place as seen from any working directory."""
-    dataset = lerobot_name(place)
+    if dataset_name(place, MINARI) is not None:
+        return str(place)
+    dataset = dataset_name(place, LEROBOT)
     if dataset is None:
         return str(place.resolve())
     return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
@@ -98,11 +104,12 @@ class DataOptions:
             package.module:function, which is given these options and returns a Task.
         data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
             the source).
-        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
-            Instead of generated data.
+        dataset: a robomimic HDF5 file, a LeRobotDataset (lerobot:FOLDER, or lerobot:USER/NAME of the hub), or
+            a Minari dataset (minari:NAME). Instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         mask: name of a mask in the file, such as train; only its demonstrations are used.
+        horizon: control steps per episode of a Minari dataset's environment (default: its own).
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
         actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
@@ -124,6 +131,7 @@ class DataOptions:
     download: bool = False
     force_download: bool = False
     mask: str | None = None
+    horizon: int | None = None
     demonstrations: tuple[int, ...] = ()
     actions: Literal["delta", "absolute"] = "delta"
     obs: Literal["state", "image"] = "state"
@@ -132,7 +140,7 @@ class DataOptions:
     fast_rendering: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, "demonstrations", "image_size")
+        check_counts(self, "demonstrations", "image_size", "horizon")
         if len(self.demonstrations) > 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got {self.demonstrations}"
@@ -233,8 +241,8 @@ def robosuite_task(
             raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
         size, fast = options.image_size, options.fast_rendering
         place = with_images(path, named, cameras, size, fast, demos=demos, mask=options.mask)
-        seen = {"cameras": cameras, "fast_rendering": fast}
-    task = Task.from_file(
+        seen = {"image_keys": image_names(cameras), "fast_rendering": fast}
+    task = Task.open(
         place,
         task=named,
         style=style,
@@ -242,6 +250,7 @@ def robosuite_task(
         actions=options.actions,
         mask=options.mask,
         demos=demos,
+        horizon=options.horizon,
         **seen,
     )
     if task.environment is None:
@@ -250,6 +259,8 @@ def robosuite_task(
             "train without an environment (python -m warmprior train), or describe a task of your own "
             "(docs/benchmarks.md)"
         )
+    if "gymnasium" in task.environment:
+        return task
     facts, digest = task.facts | {"source": source}, task.digest
     if place != path:  # of what it was rendered from
         original = opened(path)

@@ -95,7 +95,7 @@ def path(tmp_path_factory):
 
 
 def in_both_spaces(path):
-    return [Task.from_file(path, actions=a) for a in ("delta", "absolute")]
+    return [Task.open(path, actions=a) for a in ("delta", "absolute")]
 
 
 def test_absolute_actions_have_the_units_of_deltas(path):
@@ -117,14 +117,14 @@ def test_absolute_actions_have_the_units_of_deltas(path):
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 
-    whole, part, all_ = (Task.from_file(path, demos=n) for n in (None, 1, 2))
+    whole, part, all_ = (Task.open(path, demos=n) for n in (None, 1, 2))
     assert all_.identity == whole.identity != part.identity  # other policies, of the same file
     assert part.facts["sha256"] == whole.facts["sha256"]
     assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
     mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
     assert torch.allclose(mine, theirs[:30], atol=1e-6)
     with pytest.raises(DatasetError, match=r"2 demonstrations.*demos=3"):
-        Task.from_file(path, demos=3)
+        Task.open(path, demos=3)
 
 
 def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
@@ -144,12 +144,12 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     from warmprior.data import convert_robomimic
 
     folder = convert_robomimic(path, tmp_path / "lift")
-    file, theirs = (Task.from_file(p, task="lift") for p in (path, f"lerobot:{folder}"))
+    file, theirs = (Task.open(p, task="lift") for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity
     (folder / "meta" / "warmprior.json").unlink()  # as from another converter
     for actions, width in (("delta", 7), ("absolute", 10)):
-        named = Task.from_file(f"lerobot:{folder}", task="lift", actions=actions)
+        named = Task.open(f"lerobot:{folder}", task="lift", actions=actions)
         assert named.data["action"].shape[-1] == width
         assert named.environment["robosuite"]["env_args"]["env_name"] == "Lift"
     assert opened(f"lerobot:{folder}", "lift").name == "lerobot:lift"

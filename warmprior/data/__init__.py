@@ -1,15 +1,17 @@
-"""Demonstrations as one TensorDict of steps: files of robomimic and MimicGen, and LeRobot's datasets."""
+"""Demonstrations as one TensorDict of steps: files of robomimic, and datasets of LeRobot and Minari."""
 
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
 from warmprior.data.lerobot import LeRobotDemonstrations, lerobot_steps
+from warmprior.data.minari import MinariDemonstrations
 from warmprior.data.replay import DatasetError
 from warmprior.data.robomimic import RobomimicDemonstrations
 
 __all__ = [
     "DatasetError",
     "LeRobotDemonstrations",
+    "MinariDemonstrations",
     "RobomimicDemonstrations",
     "convert_robomimic",
     "lerobot_steps",

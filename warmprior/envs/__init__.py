@@ -8,7 +8,7 @@ from warmprior.envs.env_args import (
     delta_conventions,
     modernize_env_args,
 )
-from warmprior.envs.gymnasium import gym_env
+from warmprior.envs.gymnasium import gym_env, registered_env
 from warmprior.envs.navigation1d import (
     NavigationEnv,
     NavigationMetrics,
@@ -38,5 +38,6 @@ __all__ = [
     "navigation_heights",
     "navigation_metrics",
     "navigation_positions",
+    "registered_env",
     "rendering_backend",
 ]

@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior.envs.env_args import delta_conventions
+from warmprior.envs.gymnasium import registered_env
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
@@ -83,16 +84,20 @@ def robosuite_parts(
     return partial(RobosuiteEnv, **options), transforms
 
 
-def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
+def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
     """What builds the environment that a policy was made for, and what builds the policy's transforms.
 
     A ``ValueError`` if the policy keeps no description of an environment.
     """
     description: Any = actor.environment
-    if not _is_complete(description):
-        what = f"no description of a robosuite environment, but {description}"
+    adapters: dict[str, Transform] = {}
+    if _is_registered(description):
+        make_env: Callable[..., EnvBase] = partial(registered_env, description["gymnasium"])
+    elif _is_complete(description):
+        make_env, adapters = robosuite_parts(description)
+    else:
+        what = f"no description of an environment of robosuite or Gymnasium, but {description}"
         raise ValueError(f"the policy keeps {what}: build yours with policy_transforms(actor)")
-    make_env, adapters = robosuite_parts(description)
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(
         policy_transforms,
@@ -111,7 +116,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
     """The environment that a policy was made for, with the policy's own transforms.
 
-    ``options`` are further ones of :class:`RobosuiteEnv`.
+    ``options`` are further ones of :class:`RobosuiteEnv`, or of :func:`registered_env`.
 
     Raises:
         ValueError: if the policy keeps no description of one.
@@ -122,19 +127,41 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
         Traceback (most recent call last):
             ...
-        ValueError: the policy keeps no description of a robosuite environment, but None: build ...
+        ValueError: the policy keeps no description of an environment of robosuite or Gymnasium, but None...
     """
     make_env, make_transforms = environment_parts(actor)
-    return TransformedEnv(make_env(**options), make_transforms())
+    return TransformedEnv(make_env(**options), make_transforms(), auto_unwrap=False)
 
 
 def environment_name(actor: WarmPriorActor) -> str | None:
-    """Robosuite's name of the environment that a policy was made for, if it is known."""
+    """What robosuite or Gymnasium calls the environment that a policy was made for, if it is known."""
+    description: Any = actor.environment
+    if _is_registered(description):
+        return str(description["gymnasium"]["id"])
     try:
-        description: Any = actor.environment
         return str(description["robosuite"]["env_args"]["env_name"])
     except (KeyError, TypeError):  # none, or a description of the user's own
         return None
+
+
+_REGISTERED = {"id", "kwargs", "max_episode_steps", "success", "observation_keys"}
+
+
+def registered_description(environment: Mapping[str, Any], observation_steps: int) -> dict[str, Any]:
+    """What :func:`environment_of` needs of an environment that :func:`registered_env` builds."""
+    return {
+        "gymnasium": {name: environment.get(name) for name in sorted(_REGISTERED)},
+        "observation_steps": observation_steps,
+    }
+
+
+def _is_registered(description: Any) -> bool:
+    """Whether it is what :func:`registered_description` gives."""
+    try:
+        known = description.keys() == {"gymnasium", "observation_steps"}
+        return known and description["gymnasium"].keys() == _REGISTERED
+    except AttributeError:
+        return False
 
 
 def _is_complete(description: Any) -> bool:

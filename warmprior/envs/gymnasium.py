@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import CatTensors, Compose, DoubleToFloat, GymWrapper, TransformedEnv
+from torchrl.envs import CatTensors, Compose, DoubleToFloat, GymWrapper, RenameTransform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from warmprior.keys import OBSERVATION
+from warmprior.keys import OBSERVATION, SUCCESS
 
 
 class _Infos(BaseInfoDictReader):
@@ -35,6 +37,15 @@ class _Gym(GymWrapper):
     """An episode after ``set_seed(seed)`` is that of ``reset(seed=seed)``, with one reset."""
 
     _next: int | None = None
+    ends_at: str | None = None
+    """A flag that ends the episode, of those that ``info`` says."""
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        found = super()._step(tensordict)
+        if self.ends_at is not None and found[self.ends_at].any():
+            for flag in ("terminated", "done"):
+                found.set(flag, torch.ones_like(found[flag]))
+        return found
 
     def _set_seed(self, seed: int | None) -> None:
         self._next = seed
@@ -51,6 +62,7 @@ def gym_env(
     success: str | None = None,
     measures: Sequence[str] = (),
     observation_keys: Sequence[str] = (),
+    terminate_on_success: bool = False,
 ) -> TransformedEnv:
     """A Gymnasium environment with ``"observation"`` ``[d_o]``, float32, and what its ``info`` says.
 
@@ -58,7 +70,9 @@ def gym_env(
         env: a Gymnasium environment whose action is one vector.
         success: name of the ``info`` that says whether the task is solved; bool ``[1]`` under the same key.
         measures: names of further numbers in ``info``, float32 ``[1]`` each.
-        observation_keys: entries of a dictionary of observations, concatenated in this order; by default all.
+        observation_keys: entries of a dictionary of observations, concatenated in this order, and
+            ``"outer/inner"`` of one in another; by default all.
+        terminate_on_success: whether solving the task ends the episode.
 
     Raises:
         KeyError: if there is no such entry.
@@ -71,15 +85,78 @@ def gym_env(
         (torch.Size([3]), False)
     """
     base = _Gym(env, categorical_action_encoding=True)
-    present = [key for key in base.observation_spec.keys(True, True) if isinstance(key, str)]
-    chosen = list(observation_keys) or present
+    names = base.observation_spec.keys(True, True)
+    present = {key if isinstance(key, str) else "/".join(key): key for key in names}
+    chosen = list(observation_keys) or list(present)
     if missing := [key for key in chosen if key not in present]:
-        raise KeyError(f"the environment has no observations {missing}: it has {present}")
+        raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
     dtypes = {success: torch.bool} if success is not None else {}
     dtypes |= dict.fromkeys(measures, torch.float32)
     if dtypes:
         base.set_info_dict_reader(_Infos(dtypes))
+    base.ends_at = success if terminate_on_success else None
     transforms = [DoubleToFloat()]
     if chosen != [OBSERVATION]:
-        transforms.append(CatTensors(chosen, OBSERVATION, sort=False))
+        transforms.append(CatTensors([present[key] for key in chosen], OBSERVATION, sort=False))
     return TransformedEnv(base, Compose(*transforms))
+
+
+REGISTERING = ("gymnasium_robotics", "gym_pusht")
+"""Packages that register environments when they are imported, where they are installed."""
+
+
+def registered_env(
+    description: Mapping[str, Any],
+    *,
+    terminate_on_success: bool = True,
+    horizon: int | None = None,
+) -> TransformedEnv:
+    """An environment of Gymnasium's registry, as data or a policy describe it.
+
+    Nothing that a description names is imported: its environment has to be registered, by a package of
+    :data:`REGISTERING` or one that you import before.
+
+    Args:
+        description: ``"id"`` and ``"kwargs"`` of ``gymnasium.make``, ``"max_episode_steps"``, and
+            ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is said under ``"success"``.
+        terminate_on_success: see :func:`gym_env`.
+        horizon: steps per episode, in place of ``"max_episode_steps"``.
+
+    Raises:
+        ValueError: if there is no such environment, or it has wrappers, which would be imported.
+
+    Examples:
+        >>> from warmprior.envs import registered_env
+        >>> env = registered_env({"id": "Pendulum-v1", "max_episode_steps": 3})
+        >>> env.rollout(9)["next", "truncated"].flatten().tolist()
+        [False, False, True]
+    """
+    gymnasium = importlib.import_module("gymnasium")
+    name, wrappers = description["id"], description.get("wrappers")
+    for package in REGISTERING if name not in gymnasium.registry else ():
+        if find_spec(package) is not None:
+            importlib.import_module(package)
+    if name not in gymnasium.registry:
+        raise ValueError(
+            f"Gymnasium has no environment {name!r}: install the package that registers it, and import that "
+            "before (gymnasium-robotics: pip install --no-deps gymnasium-robotics pettingzoo imageio)"
+        )
+    if wrappers:
+        raise ValueError(
+            f"{name} was recorded with the wrappers {wrappers}: build it yourself, with make_env"
+        )
+    env = gymnasium.make(
+        name,
+        max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
+        **description.get("kwargs", {}),
+    )
+    success = description.get("success")
+    made = gym_env(
+        env,
+        success=success,
+        observation_keys=description.get("observation_keys") or (),
+        terminate_on_success=terminate_on_success and success is not None,
+    )
+    if success not in (None, SUCCESS):
+        made.append_transform(RenameTransform([success], [SUCCESS]))
+    return made

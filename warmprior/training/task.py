@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.checks import check_choice, check_keys
+from warmprior.checks import check_choice, check_keys, check_whole_numbers
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -29,7 +30,7 @@ from warmprior.transforms.policy import policy_transforms
 class Task:
     """Demonstrations and an environment: what every policy of a comparison is trained for.
 
-    :meth:`of` takes raw demonstrations and a function that builds the environment, :meth:`from_file` a file.
+    :meth:`of` takes raw demonstrations and a function that builds the environment, :meth:`open` a place.
 
     Attributes:
         name: short name, such as ``"square"``.
@@ -106,8 +107,9 @@ class Task:
         """A task of your own, from raw demonstrations; the normaliser is fitted to them.
 
         Arguments are the attributes, but for the data: contiguous steps ``[N]`` in raw units, with
-        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
-        Without ``make_env`` policies are trained and not played.
+        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and ``"episode"``, an integer ``[N]``. With
+        images ``"observation"`` has the entries ``"state"`` ``[N, d_o]`` and each image, uint8
+        ``[N, 3, size, size]``. Without ``make_env`` policies are trained and not played.
 
         Raises:
             KeyError: naming what the data lack.
@@ -117,7 +119,17 @@ class Task:
             raise ValueError(f"the demonstrations of {name} must be flat steps [N], got {tuple(data.shape)}")
         needed = (OBSERVATION, ACTION, EPISODE)
         check_keys(data, needed, f"the demonstrations of {name}", f": they have {list(data.keys())}")
-        for key in (OBSERVATION, ACTION):
+        vector: NestedKey = OBSERVATION
+        if isinstance(data[OBSERVATION], TensorDictBase):
+            vector = (OBSERVATION, STATE)
+            check_keys(data, [vector], f"the demonstrations of {name}", ", the robot's state beside images")
+            for key, image in data[OBSERVATION].items():
+                if key != STATE and (image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3):
+                    raise ValueError(
+                        f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, and images are "
+                        "uint8 [N, 3, size, size]"
+                    )
+        for key in (vector, ACTION):
             if data[key].ndim != 2:
                 raise ValueError(f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]")
         episode = data[EPISODE]
@@ -126,7 +138,7 @@ class Task:
                 f"{EPISODE!r} of {name} must count the demonstrations, integers [N] from 0 on, got "
                 f"{episode.dtype} {tuple(episode.shape)}"
             )
-        normalizer = Normalizer.fit(data)
+        normalizer = Normalizer.fit(data, (vector, ACTION))
         return cls(
             name,
             style,
@@ -141,38 +153,43 @@ class Task:
         )
 
     @classmethod
-    def from_file(
+    def open(
         cls,
         place: str | Path,
         make_env: Callable[..., EnvBase] | None = None,
         *,
         task: str | None = None,
-        style: str = "ph",
+        style: str | None = None,
         observation_steps: int = 2,
         actions: Literal["delta", "absolute"] = "delta",
         observation_keys: Sequence[str] | None = None,
-        cameras: Sequence[str] = (),
+        image_keys: Sequence[str] = (),
         fast_rendering: bool = False,
         mask: str | None = None,
         demos: int | None = None,
+        horizon: int | None = None,
         **outcome: Any,
     ) -> Self:
-        """The demonstrations of a file, and the robosuite environment that recorded them if that is known.
+        """The demonstrations at a place, and the environment that recorded them if that is known.
 
         Args:
-            place: a robomimic HDF5 file, or ``lerobot:`` and the folder or repository of a LeRobotDataset.
+            place: a robomimic HDF5 file; ``lerobot:`` and the folder or repository of a LeRobotDataset; or
+                ``minari:`` and the name of a Minari dataset.
             make_env: see :meth:`of`; instead of the recorded environment.
 
         Keyword Args:
             task: of robosuite, for a LeRobotDataset that does not describe its environment.
-            style: of the demonstrations, which decides the time limit.
+            style: of the demonstrations, which decides robosuite's time limit: ``"ph"`` by default, and
+                ``"human"`` elsewhere.
             observation_steps: ``To`` of the policies.
             actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
-            observation_keys: observations to concatenate; the task's by default.
-            cameras: whose images policies see, beside the state of the robot; none by default.
+            observation_keys: observations to concatenate; the task's by default, or of a Minari dataset all.
+            image_keys: images that policies see, beside the state of the robot, such as
+                ``"agentview_image"``; none by default.
             fast_rendering: whether the images are without reflections, shadows and smooth edges.
             mask: a mask of the file, such as ``"train"``.
             demos: how many to take, from the first on; all by default.
+            horizon: control steps per episode in an environment of Gymnasium; its own by default.
             **outcome: ``success``, ``measures`` and ``film_rate`` beside a ``make_env``, see :meth:`of`.
 
         Raises:
@@ -182,20 +199,38 @@ class Task:
 
         Examples:
             >>> from warmprior.training import Task
-            >>> Task.from_file("square.hdf5", mask="train").name  # doctest: +SKIP
+            >>> Task.open("square.hdf5", mask="train").name  # doctest: +SKIP
             'square'
         """
         # Here, since training on a TensorDict needs no reader and no simulator.
         from warmprior.data.images import renderer_versions
         from warmprior.data.opening import name_of_place
+        from warmprior.envs.description import registered_description
+        from warmprior.envs.gymnasium import registered_env
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.training import files
 
         found = files.opened(place, task, mask)
         index = found.index(observation_keys=observation_keys)
         if make_env is not None or not index.env_args:
-            data = found.replay(demos=demos, observation_keys=observation_keys).data
-            return cls.of(name_of_place(place), data, make_env, style=style, **outcome)
+            storage = "memmap" if image_keys else "memory"
+            chosen: dict[str, Any] = {"observation_keys": observation_keys, "image_keys": image_keys}
+            data = found.replay(demos=demos, storage=storage, **chosen).data
+            opened = cls.of(name_of_place(place), data, make_env, style=style or "human", **outcome)
+            said = opened.facts | {"source": "file", "file": found.name}
+            environment = None if make_env is not None or image_keys else found.environment()
+            if environment is None:
+                return replace(opened, facts=said)
+            environment |= {"observation_keys": list(index.observation_keys)}
+            if horizon is not None:
+                environment["max_episode_steps"] = horizon
+            description = registered_description(environment, observation_steps)
+            # Its wrappers are refused when it is built, which a training does not need.
+            recorded: Any = partial(registered_env, environment)
+            return replace(opened, facts=said, make_env=recorded, environment=description)
+        style, cameras = style or "ph", [key.removesuffix("_image") for key in image_keys]
+        if horizon is not None:
+            raise ValueError("horizon is for environments of Gymnasium: robosuite's follows from the style")
         if demos == len(index.demos):
             demos = None  # all of them
         name = files.task_name(index)
@@ -214,7 +249,7 @@ class Task:
         recorded = files.recorded_task(
             dataset, images, style=style, observation_steps=observation_steps, actions=actions
         )
-        sha256 = found.digest(files.image_names(cameras), demos)
+        sha256 = found.digest(image_keys, demos)
         # Nothing is said of what is usual.
         space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
         space |= {} if images is None else {"obs": "image", "images": images}
@@ -255,6 +290,24 @@ class Task:
         )
         # An environment may have transforms of its own; they stay inside.
         return TransformedEnv(base or self.make_env(**options), transforms, auto_unwrap=False)
+
+    def split(self, held_out: int) -> tuple[Self, TensorDictBase | None]:
+        """The task without its last demonstrations, and their normalised steps; units are those of all.
+
+        A ``ValueError`` if none would be left.
+        """
+        check_whole_numbers(0, held_out=held_out)
+        if not held_out:
+            return self, None
+        episode = self.data[EPISODE]
+        numbers = episode.unique()
+        if held_out >= len(numbers):
+            raise ValueError(f"held_out={held_out} of {len(numbers)} demonstrations leaves none to train on")
+        kept = torch.isin(episode, numbers[:-held_out])
+        data = self.data[kept]
+        facts = self.facts | {"demonstrations": len(numbers) - held_out, "steps": len(data)}
+        digest = None if self.digest is None else digest_of(self.digest, held_out)
+        return replace(self, data=data, facts=facts, digest=digest), self.data[~kept]
 
     @cached_property
     def identity(self) -> str:

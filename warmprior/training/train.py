@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
 from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
@@ -39,12 +41,14 @@ def new_policy(
     start: StartPoint | None = None,
     coupling: Coupling | None = None,
     see_history: bool = False,
+    nfe: int | None = None,
     max_nfe: int | None = None,
 ) -> WarmPriorActor:
     """A policy with fresh weights, which depend on the training's seed alone; see :func:`train_policy`."""
     action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
     if see_history:
         observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
+    sampling: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     torch.manual_seed(training.seed)
     velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images)
     if network.precondition:
@@ -63,6 +67,7 @@ def new_policy(
         prior,
         start=start,
         max_nfe=max_nfe,
+        **sampling,
         clip=task.clip,
         observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
         # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
@@ -72,10 +77,13 @@ def new_policy(
 
 
 def train_policy(
-    demonstrations: Task | TensorDictBase,
+    demonstrations: str | Path | TensorDictBase | ReplayBuffer | Task,
     prior: Prior,
     directory: str | Path | None = None,
     *,
+    observation_keys: Sequence[str] | None = None,
+    image_keys: Sequence[str] = (),
+    nfe: int | None = None,
     network: NetworkOptions | None = None,
     training: TrainingConfig | None = None,
     start: StartPoint | None = None,
@@ -95,13 +103,17 @@ def train_policy(
     trains: another number would give other weights.
 
     Args:
-        demonstrations: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
-            ``[N, d_a]`` and ``"episode"``, an integer ``[N]``; or a :class:`Task`.
+        demonstrations: a place that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
+            ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
+            them, as :meth:`Task.of` takes them; or a :class:`Task`.
         prior: the source distribution.
         directory: where the training is saved, and continued from, see :class:`BehaviourCloning`; nowhere by
             default, so that an interruption loses it.
 
     Keyword Args:
+        observation_keys: of a place, see :meth:`Task.open`.
+        image_keys: likewise.
+        nfe: network evaluations per chunk, saved with the policy; 9 by default.
         network: the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
         start: where samplers start; at the source by default.
@@ -138,17 +150,29 @@ def train_policy(
         >>> env.rollout(3, actor)["vla_action", "chunk"].shape
         torch.Size([3, 4, 1])
     """
-    if not isinstance(demonstrations, (Task, TensorDictBase)):
-        raise TypeError(
-            f"train_policy takes a TensorDict of steps or a Task, got {type(demonstrations).__name__}; "
-            "warmprior.data reads files"
-        )
+    network, training = network or NetworkOptions(), training or TrainingConfig()
     if not isinstance(prior, Prior):
         raise TypeError(f"the prior is an object such as PastPrior(8), got {prior!r}")
-    task = demonstrations
-    if not isinstance(task, Task):
-        task = Task.of("demonstrations", task)
-    network, training = network or NetworkOptions(), training or TrainingConfig()
+    place = isinstance(demonstrations, str | Path)
+    if not place and (observation_keys is not None or image_keys):
+        raise ValueError("observation_keys and image_keys choose what is read of a file or dataset")
+    if isinstance(demonstrations, str | Path):
+        task = Task.open(
+            demonstrations,
+            observation_steps=network.observation_steps,
+            observation_keys=observation_keys,
+            image_keys=image_keys,
+        )
+    elif isinstance(demonstrations, Task):
+        task = demonstrations
+    elif isinstance(demonstrations, TensorDictBase | ReplayBuffer):
+        steps_of = demonstrations if isinstance(demonstrations, TensorDictBase) else demonstrations[:]
+        task = Task.of("demonstrations", steps_of)
+    else:
+        raise TypeError(
+            "train_policy takes a file or dataset, a TensorDict or replay buffer of steps, or a Task, got "
+            f"{type(demonstrations).__name__}"
+        )
     on_cpu = torch.device(device).type == "cpu"
     if directory is None and world_size() > 1:
         raise ValueError("processes that train together need a directory that all of them see")
@@ -169,6 +193,7 @@ def train_policy(
             start=start,
             coupling=coupling,
             see_history=see_history,
+            nfe=nfe,
             max_nfe=max_nfe,
         )
         cloning = BehaviourCloning(

@@ -1,0 +1,163 @@
+"""Datasets of Minari against Minari's own reader, and their environments."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+minari = pytest.importorskip("minari")
+
+from gymnasium.spaces import Box, Dict, Discrete  # noqa: E402
+from minari import create_dataset_from_buffers  # noqa: E402
+from minari.data_collector import EpisodeBuffer  # noqa: E402
+
+from warmprior import PastPrior  # noqa: E402
+from warmprior.__main__ import main  # noqa: E402
+from warmprior.data import DatasetError, MinariDemonstrations  # noqa: E402
+from warmprior.data.opening import Demonstrations  # noqa: E402
+from warmprior.envs import environment_of  # noqa: E402
+from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, train_policy  # noqa: E402
+
+LENGTHS = (7, 12, 5)
+VECTOR = Box(-np.inf, np.inf, (3,), np.float64)
+TREE = Dict(
+    {
+        "arm": VECTOR,
+        "goal": Dict({"place": Box(-9, 9, (2,), np.float32)}),
+        "front": Box(0, 255, (16, 16, 3), np.uint8),
+    }
+)
+ACTION = Box(-1, 1, (1,), np.float32)
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
+
+
+def drawn(space, rng, length):
+    """Values ``[length, ...]`` of a space."""
+    if isinstance(space, Dict):
+        return {key: drawn(part, rng, length) for key, part in space.spaces.items()}
+    if space.dtype == np.uint8:
+        return rng.integers(0, 255, (length, *space.shape), dtype=np.uint8)
+    if isinstance(space, Discrete):
+        return rng.integers(0, space.n, length)
+    return rng.uniform(-1, 1, (length, *space.shape)).astype(space.dtype)
+
+
+def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, **options):
+    """A dataset of three episodes, and its name."""
+    rng = np.random.default_rng(0)
+    buffers = [
+        EpisodeBuffer(
+            id=i,
+            observations=drawn(observation, rng, n + 1),
+            actions=drawn(action, rng, n),
+            rewards=rng.uniform(size=n).tolist(),
+            terminations=[False] * n,
+            truncations=[False] * (n - 1) + [True],
+            infos={"success": np.arange(n) > n - 2},
+        )
+        for i, n in enumerate(LENGTHS)
+    ]
+    create_dataset_from_buffers(name, buffers, observation_space=observation, action_space=action, **options)
+    return name
+
+
+def test_steps_are_those_of_minari():
+    name = written()
+    data = MinariDemonstrations(name).data
+    assert data["episode"].tolist() == [i for i, n in enumerate(LENGTHS) for _ in range(n)]
+    for i, episode in enumerate(minari.load_dataset(name).iterate_episodes()):
+        mine = data[data["episode"] == i]
+        np.testing.assert_array_equal(mine["observation"], episode.observations[:-1].astype(np.float32))
+        np.testing.assert_array_equal(mine["action"], episode.actions)
+        np.testing.assert_array_equal(mine["next", "reward"][:, 0], episode.rewards.astype(np.float32))
+    assert MinariDemonstrations(name, demos=2).num_episodes == 2
+
+
+def test_entries_of_dictionaries_are_chosen_by_name():
+    name = written(observation=TREE)
+    own = next(minari.load_dataset(name).iterate_episodes()).observations
+    chosen = {"observation_keys": ["goal/place", "arm"], "image_keys": ["front"]}
+    data = Demonstrations(f"minari:{name}").replay(**chosen).data[: LENGTHS[0]]
+    expected = np.concatenate([own["goal"]["place"], own["arm"]], -1)[:-1].astype(np.float32)
+    np.testing.assert_array_equal(data["observation", "state"], expected)
+    np.testing.assert_array_equal(data["observation", "front"], own["front"][:-1].transpose(0, 3, 1, 2))
+    assert MinariDemonstrations(name).observation_keys == ("arm", "goal/place")
+    for wrong in ({"observation_keys": ["leg"]}, {"image_keys": ["side"]}):
+        with pytest.raises(DatasetError, match=r"leg.*arm, goal/place|side.*front"):
+            MinariDemonstrations(name, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"action": Discrete(3)}, "Discrete"),
+        ({"action": Box(-1, 1, (2, 2), np.float32)}, r"\(2, 2\)"),
+    ],
+)
+def test_actions_that_are_no_vector_are_refused(options, said):
+    with pytest.raises(DatasetError, match=said):
+        MinariDemonstrations(written(**options))
+
+
+def test_what_there_is_not(root):
+    with pytest.raises(FileNotFoundError, match=r"toy/none/human-v0.*MINARI_DATASETS_PATH"):
+        MinariDemonstrations("toy/none/human-v0")
+    name = written()
+    for options in ({"filter_key": "train"}, {"absolute_actions": True}, {"demos": 4}):
+        with pytest.raises(DatasetError):
+            MinariDemonstrations(name, **options)
+    (data,) = root.rglob("main_data.hdf5")
+    data.write_bytes(data.read_bytes()[:900])
+    with pytest.raises(DatasetError, match="walk/human-v0"):
+        MinariDemonstrations(name)
+
+
+def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, capsys):
+    name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
+    task = Task.open(f"minari:{name}", horizon=9)
+    small, short = NetworkOptions(hidden_dim=8), TrainingConfig(iterations=2)
+    actor = train_policy(task, PastPrior(4), tmp_path / "run", nfe=1, network=small, training=short)
+    assert actor.sampling.nfe == 1
+    actor = load_policy(tmp_path / "run" / "policy_000002")
+    env = environment_of(actor)
+    rollout = env.rollout(9, actor)
+    assert rollout["next", "executed_steps"].flatten().tolist() == [4, 4, 1]
+    assert not main(
+        ["evaluate", str(tmp_path / "run" / "policy_000002"), "--episodes", "1", "--nfe", "1", "3"]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["NFE 1", "NFE 3"]
+
+
+def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
+    place = f"minari:{written(observation=TREE)}"
+    options = ["--observation-keys", "arm", "--iterations", "2", "--hidden-dim", "8", "--held-out", "1"]
+    assert not main(["train", place, "--out", str(tmp_path), "--nfe", "1", *options])
+    said = capsys.readouterr().out
+    assert "1 demonstrations" in said and "NFE 1" in said and "NFE 9" in said
+    task = Task.open(place)
+    with pytest.raises(ValueError, match="environment"):
+        task.make_env()
+
+
+def test_nothing_named_in_a_dataset_is_imported(root):
+    name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
+    (metadata,) = root.rglob("metadata.json")
+    text = metadata.read_text()
+    for there, other in (("Pendulum-v1", "evil-v1"), ("Pendulum-v1", "evil:Pendulum-v1")):
+        metadata.write_text(text.replace(there, other))
+        task = Task.open(f"minari:{name}")
+        with pytest.raises(ValueError, match=other):
+            task.make_env()
+    entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+    assert entry in text
+    metadata.write_text(text.replace(entry, "evil:Env"))  # the registry's own is built
+    assert isinstance(Task.open(f"minari:{name}").make_env(), torch.nn.Module)
+    assert gymnasium.registry["Pendulum-v1"].entry_point == entry

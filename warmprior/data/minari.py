@@ -1,0 +1,242 @@
+"""Minari's demonstrations: a dataset of the Farama Foundation's format, read by its own package."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warmprior.data.replay import (
+    DatasetError,
+    DatasetIndex,
+    DemonstrationReader,
+    DemonstrationReplay,
+    check_count,
+    common_size,
+    store_finite,
+    unknown,
+)
+from warmprior.io.extras import require
+
+SUCCESS_NAMES = ("success", "is_success")
+"""What environments of Gymnasium call success in their ``info``."""
+
+
+def load_minari(name: str) -> Any:
+    """The dataset of a name such as ``"D4RL/door/human-v2"``, downloaded if it is not there.
+
+    Raises:
+        FileNotFoundError: if it is neither on this machine nor to be had.
+        DatasetError: if it is damaged.
+    """
+    minari = require("minari", "minari")
+    try:
+        return minari.load_dataset(name, download=True)
+    except Exception as error:
+        here = (
+            minari.dataset.minari_dataset.__dict__.get("get_dataset_path") or minari.storage.get_dataset_path
+        )
+        folder = Path(here(name))
+        if (folder / "data").exists():
+            raise DatasetError(
+                f"{folder}: not a readable dataset of Minari ({error}): download it again"
+            ) from error
+        raise FileNotFoundError(
+            f"minari:{name}: no such dataset at {folder} ({error}): `minari list remote` shows public "
+            "ones, and MINARI_DATASETS_PATH says where local ones are"
+        ) from error
+
+
+def read_minari_index(
+    name: str,
+    *,
+    observation_keys: Sequence[str] | None = None,
+    image_keys: Sequence[str] = (),
+    demos: int | None = None,
+    filter_key: str | None = None,
+    poses: bool = False,
+) -> DatasetIndex:
+    """What a dataset holds; see :class:`MinariDemonstrations` for the arguments."""
+    dataset = load_minari(name)
+    where = Path(dataset.spec.data_path)
+    if filter_key is not None or poses:
+        what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
+        raise DatasetError(f"{where}: a dataset of Minari has no {what}: leave the option out")
+    action = dataset.action_space
+    if getattr(action, "dtype", None) is None or action.dtype.kind != "f" or len(action.shape) != 1:
+        raise DatasetError(f"{where}: actions are {action}, and a flow needs one vector of real numbers")
+    spaces = dict(_spaces(dataset.observation_space))
+    vectors = {key: math.prod(space.shape) for key, space in spaces.items() if _is_vector(space)}
+    pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
+    chosen = tuple(vectors if observation_keys is None else observation_keys)
+    for key in chosen:
+        if key not in vectors:
+            raise unknown(where, "observation", key, vectors)
+    for key in image_keys:
+        if key not in pictures:
+            raise unknown(where, "image", key, pictures)
+    check_count(where, demos, dataset.total_episodes)
+    episodes = [int(i) for i in dataset.episode_indices][:demos]
+    with _reading(where, "its episodes"):
+        steps = [int(found["total_steps"]) for found in dataset.storage.get_episode_metadata(episodes)]
+    if not steps or min(steps) < 1:
+        raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
+    return DatasetIndex(
+        path=where,
+        demos=tuple(map(str, episodes)),
+        lengths=tuple(steps),
+        observation_keys=chosen,
+        observation_dims=tuple(vectors[key] for key in chosen),
+        image_keys=tuple(image_keys),
+        image_size=common_size(where, {pictures[key][0]: key for key in image_keys}),
+        available_keys=(*vectors, *pictures),
+        action_dim=action.shape[0],
+        env_args={},
+        task=None,
+    )
+
+
+@contextmanager
+def _reading(path: Path, what: str) -> Iterator[None]:
+    """Name the dataset in whatever goes wrong while it is read."""
+    try:
+        yield
+    except Exception as error:  # h5py's own, OSError, KeyError for its groups...
+        raise DatasetError(f"{path}: {what} cannot be read ({error}): download it again") from error
+
+
+def _spaces(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of a space by name; those of a dictionary in another are ``"outer/inner"``."""
+    inner = getattr(space, "spaces", None)
+    if isinstance(inner, Mapping):
+        for key, part in inner.items():
+            yield from _spaces(part, f"{name}/{key}" if name else str(key))
+    else:
+        yield name or "observation", space
+
+
+def _is_vector(space: Any) -> bool:
+    return len(space.shape or ()) == 1 and space.dtype.kind in "fiub"
+
+
+def _is_picture(space: Any) -> bool:
+    shape: tuple[int, ...] = space.shape or ()
+    return len(shape) == 3 and shape[0] == shape[1] and shape[2] == 3 and space.dtype == np.uint8
+
+
+class MinariReader(DemonstrationReader):
+    """The values of a dataset."""
+
+    def __init__(self, name: str, path: Path) -> None:
+        self._dataset, self._path = load_minari(name), path
+        self._episode = lru_cache(maxsize=1)(self._read)  # its observations, actions and rewards one by one
+
+    def _read(self, demo: str) -> Any:
+        with _reading(self._path, f"episode {demo}"):
+            return next(self._dataset.iterate_episodes([int(demo)]))
+
+    def _values(self, demo: str, key: str) -> np.ndarray:
+        episode = self._episode(demo)
+        if not key.startswith("obs/"):
+            return np.asarray(getattr(episode, key))
+        found = episode.observations
+        if isinstance(found, Mapping):
+            for part in key.removeprefix("obs/").split("/"):
+                found = found[part]
+        return np.asarray(found)[:-1]  # the last one follows the last action
+
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """See the base class."""
+        values = self._values(demo, key)
+        block = values.reshape(len(values), -1)[first : first + len(out)]
+        if block.shape != out.shape:
+            raise DatasetError(
+                f"{self.name(demo, key)} has shape {values.shape}, not {list(out.shape)}: download it again"
+            )
+        store_finite(block, out, self.name(demo, key), first, "Delete the episode, or download it again.")
+
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """See the base class."""
+        frames = torch.from_numpy(self._values(demo, f"obs/{key}")[: len(out)])
+        out.copy_(frames.permute(0, 3, 1, 2))
+
+    def name(self, demo: str, key: str) -> str:
+        """See the base class."""
+        return f"{self._path}: {key.removeprefix('obs/')} of episode {demo}"
+
+
+class MinariDemonstrations(DemonstrationReplay):
+    """Demonstrations of a Minari dataset, as one immutable TorchRL replay buffer.
+
+    It has the entries and properties of :class:`RobomimicDemonstrations`. An observation that follows the
+    last action of an episode is left out.
+
+    Args:
+        name: of the dataset, such as ``"D4RL/door/human-v2"``. One that is not in Minari's folder
+            (``MINARI_DATASETS_PATH``) is downloaded.
+        observation_keys: observations to concatenate: names of a dictionary of them, ``"outer/inner"`` for
+            one in another; all vectors by default.
+        image_keys: images to read as well, square ones.
+        demos: how many to take, from the first on; all by default.
+        filter_key: there are no masks: ``None``.
+        absolute_actions: there are no poses: ``False``.
+        **kwargs: see :class:`RobomimicDemonstrations`.
+
+    Raises:
+        FileNotFoundError: if there is no such dataset.
+        DatasetError: if it is damaged, or its actions are no vector of real numbers.
+
+    Examples:
+        >>> from warmprior.data import MinariDemonstrations
+        >>> data = MinariDemonstrations("D4RL/door/human-v2", batch_size=256)  # doctest: +SKIP
+        >>> data.sample()["observation"].shape  # doctest: +SKIP
+        torch.Size([256, 39])
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        filter_key: str | None = None,
+        demos: int | None = None,
+        observation_keys: Sequence[str] | None = None,
+        image_keys: Sequence[str] = (),
+        absolute_actions: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        index = read_minari_index(
+            name,
+            observation_keys=observation_keys,
+            image_keys=image_keys,
+            demos=demos,
+            filter_key=filter_key,
+            poses=absolute_actions,
+        )
+        super().__init__(index, MinariReader(name, index.path), **kwargs)
+
+
+def minari_environment(name: str) -> dict[str, Any] | None:
+    """What a dataset says of its environment, for :func:`warmprior.envs.registered_env`.
+
+    ``None`` if it has none. ``"success"`` is what its steps call success, if they do.
+    """
+    dataset = load_minari(name)
+    spec = dataset.env_spec
+    if spec is None:
+        return None
+    with _reading(Path(dataset.spec.data_path), "the first episode"):
+        infos = next(dataset.iterate_episodes()).infos or {}
+    return {
+        "id": spec.id,
+        "kwargs": dict(spec.kwargs or {}),
+        "wrappers": [wrapper.name for wrapper in spec.additional_wrappers or ()],
+        "max_episode_steps": spec.max_episode_steps,
+        "success": next((key for key in SUCCESS_NAMES if key in infos), None),
+    }
