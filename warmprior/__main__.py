@@ -251,6 +251,13 @@ def convert(args: argparse.Namespace) -> None:
     print(convert_robomimic(args.file, args.folder, images=args.images, demos=args.demonstrations))
 
 
+def observe(args: argparse.Namespace) -> None:
+    """Replay raw recordings of robosuite, and write a robomimic file with observations."""
+    from warmprior.data import observe_recordings
+
+    print(observe_recordings(args.file, args.out, demos=args.demonstrations))
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
@@ -312,6 +319,11 @@ def make_parser() -> argparse.ArgumentParser:
     kept = {"action": "store_const", "dest": "images"}
     add("--images", **kept, const="image", help="with those of the file, as lossless pictures")
     add("--video", **kept, const="video", help="with those of the file, as videos: lossy, smaller")
+    add("--demonstrations", type=int, help="how many, from the first on (default: all)")
+
+    add = command(observe)
+    add("file", type=Path, help="such as demo.hdf5 of robosuite's collect_human_demonstrations")
+    add("out", type=Path, help="file to write; must not exist")
     add("--demonstrations", type=int, help="how many, from the first on (default: all)")
     return parser
 

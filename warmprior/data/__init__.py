@@ -5,6 +5,7 @@ from __future__ import annotations
 from warmprior.data.convert import convert_robomimic
 from warmprior.data.lerobot import LeRobotDemonstrations, lerobot_steps
 from warmprior.data.minari import MinariDemonstrations
+from warmprior.data.observe import observe_recordings
 from warmprior.data.replay import DatasetError
 from warmprior.data.robomimic import RobomimicDemonstrations
 
@@ -15,4 +16,5 @@ __all__ = [
     "RobomimicDemonstrations",
     "convert_robomimic",
     "lerobot_steps",
+    "observe_recordings",
 ]

@@ -41,9 +41,7 @@ _MAX_SOFT_LINKS = 16
 _AGAIN = "Copy or download it again."
 _COPY = "That one is not read: copy the data into this file."
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
-_OBSERVE = (
-    "take the low_dim file, or replay states (robomimic: convert_robosuite.py, dataset_states_to_obs.py)"
-)
+_OBSERVE = "take the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
 
 
 @contextmanager
@@ -202,7 +200,7 @@ def _mask(file: h5py.File, filter_key: str) -> set[str]:
         return {entry.decode() for entry in entries[()]}
 
 
-def _selected(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
+def selected_demos(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
     """Return the names of the demos, or of those in a mask, in the order of their numbers."""
     present = set(names(file["data"]))
     selected = present if filter_key is None else _mask(file, filter_key)
@@ -216,7 +214,7 @@ def _selected(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
     return tuple(sorted(selected, key=lambda name: int(name[5:])))  # not zero padded: 10 comes after 9
 
 
-def _described(file: h5py.File, name: str) -> Any:
+def read_described(file: h5py.File, name: str) -> Any:
     """Read an attribute of the demos, which is JSON; ``None`` if there is none."""
     with reading(file, f"data.attrs[{name!r}]"):
         attributes = file["data"].attrs
@@ -238,7 +236,7 @@ def _check_total(file: h5py.File, steps: int) -> None:
 def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
     """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
     with open_robomimic(path) as file:
-        rendering = _described(file, "rendering")
+        rendering = read_described(file, "rendering")
         states = member(file, f"data/{demo}/states", "dataset")
         with reading(file, f"data/{demo}/states"):
             state = np.asarray(states[0], np.float64) if states is not None and states.size else None
@@ -313,22 +311,20 @@ def read_index(
     """
     path = Path(path)
     with open_robomimic(path) as file:
-        selected = _selected(file, filter_key)
+        selected = selected_demos(file, filter_key)
         check_count(path, demos, len(selected))
         selected = selected[:demos]
         observations = member(file, f"data/{selected[0]}/obs", "group")
         available = () if observations is None else tuple(names(observations))
-        described = _described(file, "env_args")
-        if described is None:
-            lacks = f"{path}: data has no attribute 'env_args', which names the environment"
-            if observations is not None:
-                raise DatasetError(f"{lacks}: add it, the JSON of env_name and env_kwargs")
+        described = read_described(file, "env_args")
+        if described is None and observations is None:
             raise DatasetError(
-                f"{lacks}, and its demos have no group 'obs': recordings of robosuite hold states without "
+                f"{path}: its demos have no group 'obs': recordings of robosuite hold states without "
                 f"observations: {_OBSERVE}"
             )
-        env_args = check_env_args(f"{path}: data.attrs['env_args']", described)
-        task = task_of_env(env_args)
+        # Of a robot, or a simulator, that is none of robosuite's.
+        env_args = {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
+        task = task_of_env(env_args) if env_args else None
         if observation_keys is not None:
             keys = tuple(observation_keys)
         elif task is not None:
@@ -342,7 +338,7 @@ def read_index(
             actions = member(file, f"data/{selected[0]}/actions", "dataset")
             width = actions.shape[-1] if actions is not None and actions.shape else 0
             wanted += [f"obs/{key}" for key in pose_keys(width)]
-        expected, whose = {}, env_args["env_name"]
+        expected, whose = {}, env_args.get("env_name", str(path))
         if task is not None:
             expected["actions"] = task.action_dim
             if observation_keys is None:
@@ -362,7 +358,7 @@ def read_index(
                         f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. Use "
                         "demos of one environment with pose-delta actions, or choose observation_keys."
                     )
-            expected, whose = widths, f"data/{selected[0]} of {env_args['env_name']}"
+            expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
             lengths.append(steps)
             sides = _image_sizes(demo, image_keys, steps) | sides
         if filter_key is None and demos is None:

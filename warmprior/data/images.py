@@ -15,7 +15,7 @@ from warmprior.data.opening import Demonstrations
 from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer
-from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
+from warmprior.envs.simulator import check_scene_stays, make_simulator
 from warmprior.keys import OBSERVATION
 
 RENDERER_VERSION = 2
@@ -40,15 +40,11 @@ class StateRenderer:
     def renderer(self) -> CameraRenderer:
         """Of the simulator's model, in which nothing may depend on a reset."""
         env = make_simulator(modernize_env_args(self.index.env_args))
-        placed = []
-        with isolated_numpy_seed(0):
-            for _ in range(2):
-                env.reset()  # which hides the grippers' markers, too, that no episode shows
-                model = env.sim.model._model
-                placed.append(np.concatenate([model.body_pos, model.body_quat], -1))
-        if not np.array_equal(*placed):
-            path, name = self.index.path, self.index.env_args["env_name"]
-            raise DatasetError(f"{path}: {name} moves fixtures at resets: images do not follow from states")
+        try:
+            check_scene_stays(env)
+        except ValueError as error:
+            raise DatasetError(f"{self.index.path}: {error}: images do not follow from states") from error
+        model = env.sim.model._model
         return CameraRenderer(model, self.size, self.size, fast=self.fast)
 
     def joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:

@@ -128,6 +128,21 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
         return robosuite.make(name, **kwargs)
 
 
+def check_scene_stays(env: Any) -> None:
+    """Raise ValueError if a simulator moves fixtures at resets, which its state says nothing of.
+
+    Afterwards its model has the scene, without the grippers' markers, which no episode shows.
+    """
+    placed = []
+    with isolated_numpy_seed(0):
+        for _ in range(2):
+            env.reset()
+            model = env.sim.model._model
+            placed.append(np.concatenate([model.body_pos, model.body_quat], -1))
+    if not np.array_equal(*placed):
+        raise ValueError(f"{type(env).__name__} moves fixtures at resets")
+
+
 def action_limits(env: Any) -> list[float]:
     """The largest magnitude of each entry of an environment's action.
 
