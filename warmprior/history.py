@@ -35,6 +35,7 @@ from warmprior.checks import check_keys
 __all__ = [
     "ENTRIES",
     "advance",
+    "caught_up",
     "check_history",
     "cold_history",
     "history_keys",
@@ -113,6 +114,28 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
     actions, forecast = moved[..., :remembered, :], moved[..., remembered:, :]
     steps = (history["steps"] + executed).clamp(max=remembered)
     return _history(history.batch_size, actions, steps, forecast, length - executed)
+
+
+def caught_up(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
+    """As :func:`advance`, where up to all of a chunk was executed, and possibly more than is remembered.
+
+    That happens on robots, which go on while a decision is late.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior.history import caught_up, cold_history
+        >>> chunk = torch.arange(1.0, 5.0)[:, None]
+        >>> history = caught_up(cold_history([], 2, 4, 1), chunk, torch.tensor([3]))
+        >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
+        {'actions': [2.0, 3.0], 'forecast': [4.0, 0.0, 0.0, 0.0], 'forecast_steps': [1], 'steps': [2]}
+    """
+    left, remembered = chunk.shape[-2] - executed, history["actions"].shape[-2]
+    while True:
+        some = executed.clamp(max=remembered)
+        history = advance(history, chunk, some)
+        chunk, executed = history["forecast"], executed - some
+        if not executed.any():
+            return history.update({"forecast_steps": left})
 
 
 def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: int) -> TensorDict:

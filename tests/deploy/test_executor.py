@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import threading
 import time
-from concurrent.futures import Executor, Future
+import warnings
+from concurrent.futures import CancelledError, Executor, Future
 
 import pytest
 import torch
@@ -345,7 +347,7 @@ def test_options_that_cannot_be(options, said):
 
 
 def test_a_decision_that_fails_while_the_loop_waits():
-    """All that the history remembers is executed by then, and a forecast is left."""
+    """The loop gets the error, since no action is left, and the next call decides anew."""
 
     class Late(Failing):
         def forward(self, data):
@@ -353,9 +355,175 @@ def test_a_decision_that_fails_while_the_loop_waits():
             return super().forward(data)
 
     options = {"prior": PreviewPrior(4), "action_dim": 2, "execute": 2, "observation_steps": 1}
-    with (
-        AsyncExecutor(Late(8, {1}), **options, timeout=None) as executor,
-        pytest.warns(UserWarning, match="a decision failed"),
-    ):
-        found = [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(12)]
+    with AsyncExecutor(Late(8, {1}), **options, timeout=None) as executor:
+        found = [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(8)]
+        with pytest.raises(ZeroDivisionError, match="camera"):
+            executor.act(torch.tensor([8.0]))
+        found += [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(8, 12)]
     assert found == list(range(12))
+
+
+class Passing(Future):
+    """Waiting for it makes the time pass, unless that is not to take any."""
+
+    def exception(self, timeout=None):
+        while timeout != 0 and not self.done():
+            self.clock.advance()
+        return super().exception(0)
+
+
+class RandomClock(FakeClock):
+    """Decisions take any number of ticks, up to more than a chunk has; some fail, some are never begun."""
+
+    def __init__(self, length, seed):
+        super().__init__([])
+        self.random, self.length = random.Random(seed), length
+
+    def submit(self, fn, /, *args, **kwargs):
+        fate, long = self.random.random(), self.random.random() < 0.1
+        if fate < 0.02:
+            raise RuntimeError("cannot schedule new futures after shutdown")
+        future = Passing()
+        future.clock = self
+        if fate < 0.04:
+            future.cancel()
+            return future
+        run = args if fate > 0.1 else (None,)  # which no policy can read
+        duration = self.random.randint(0, 2 * self.length if long else 3)
+        self.running.append((self.tick + duration, future, fn, run))
+        return future
+
+    def advance(self):
+        self.tick += 1
+        for job in [job for job in self.running if job[0] <= self.tick]:
+            self.running.remove(job)
+            _, future, fn, args = job
+            if future.cancelled():
+                continue
+            try:
+                future.set_result(fn(*args))
+            except Exception as error:
+                future.set_exception(error)
+
+
+class Longer(PreviewPrior):
+    """Remembers more than it predicts."""
+
+    name = "longer-for-executors"
+    history_length = 11
+
+    def __init__(self, chunk_length):
+        super().__init__(chunk_length)
+
+
+CALLS = 50_000
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:a decision failed")
+@pytest.mark.parametrize("timeout", [0.0, None])
+@pytest.mark.parametrize("prior", [GaussianPrior(4), PastPrior(4), PreviewPrior(4), Longer(3)], ids=str)
+def test_fifty_thousand_calls(prior, timeout):
+    """Whatever is slow, late or fails, actions and histories are those of the steps that were executed."""
+    length, remembered = prior.prediction_length, prior.history_length
+    policy, clock = Told(length), RandomClock(length, seed=0)
+    executor = AsyncExecutor(
+        policy, prior=prior, action_dim=2, execute=2, observation_steps=1, timeout=timeout, pool=clock
+    )
+    done, errors, held, calls = [], 0, 0, 0
+    while calls < CALLS:
+        calls += 1
+        try:
+            # The policy is shown how much was executed, which is where its chunk begins.
+            action = executor.act(torch.tensor([float(len(done))]))
+        except TimeoutError:
+            held += 1
+        except (RuntimeError, AttributeError, CancelledError):
+            errors += 1
+        else:
+            assert action[1] == len(done)
+            done.append(action)
+        clock.advance()
+        for given in policy.given if calls % 20 == 0 else ():
+            now, history = int(given["observation"]), given["history"]
+            last = done[max(0, now - remembered) : now]
+            assert int(history["steps"]) == len(last)
+            expected = torch.stack([torch.zeros(2)] * (remembered - len(last)) + last)
+            assert torch.equal(history["actions"], expected)
+            left = int(history["forecast_steps"])
+            assert history["forecast"][:left, 1].tolist() == list(range(now, now + left))
+            assert not history["forecast"][left:].any()
+        policy.given.clear()
+    assert len(done) > CALLS / 2 and errors and (held > 100 or timeout is None)
+    assert max(executor.delays) > 1
+
+
+def test_decisions_that_take_longer_than_what_is_remembered():
+    """The loop waits, or the robot holds; and goes on."""
+    for timeout in (None, 0.0):
+        clock = RandomClock(8, seed=0)
+        clock.random = type("Always", (), {"random": lambda self: 0.5, "randint": lambda self, *ends: 6})()
+        executor = AsyncExecutor(
+            Told(8), prior=PreviewPrior(4), action_dim=2, observation_steps=1, timeout=timeout, pool=clock
+        )
+        found = []
+        while len(found) < 60:
+            try:
+                found.append(executor.act(torch.tensor([float(len(found))]))[1].item())
+            except TimeoutError:
+                assert timeout == 0.0
+            clock.advance()
+        assert found == [float(i) for i in range(60)]
+
+
+def test_several_threads_take_turns():
+    policy, found = Told(8), []
+    with AsyncExecutor(
+        policy, prior=PreviewPrior(4), action_dim=2, execute=3, observation_steps=1, timeout=None
+    ) as executor:
+
+        def loop():
+            for _ in range(100):
+                action = executor.act(torch.zeros(1))
+                found.append(action[1].item())
+                executor.expected_delay  # noqa: B018
+
+        threads = [threading.Thread(target=loop) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+    assert len(found) == 400
+    steps = executor._history["steps"]
+    assert int(steps) == 4
+
+
+def test_the_policys_own_normaliser():
+    raw = TensorDict(
+        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2) + 9}, [20]
+    )
+    normalizer = Normalizer.fit(raw)
+    own, given = (
+        AsyncExecutor(actor(PastPrior(4), **options), execute=3, latency=1, normalizer=n)
+        for options, n in (({"normalizer": normalizer}, None), ({}, normalizer))
+    )
+    for row in raw:
+        action = own.act(row["observation"])
+        assert torch.equal(action, given.act(row["observation"])) and action.min() > 5
+    plain = actor(PastPrior(4), normalizer=normalizer).replace(normalizer=None)
+    assert AsyncExecutor(plain, latency=0).act(raw[0]["observation"]).abs().max() <= 1
+    with pytest.raises(ValueError, match="no 'action'"):
+        AsyncExecutor(plain, latency=0, normalizer=Normalizer.fit(raw, ("observation",)))
+
+
+def test_a_delay_behind_what_is_guided():
+    """Guidance refuses such delays: the robot goes on all the same."""
+    guided = actor(PreviewPrior(6), guidance=RealTimeChunking(horizon=2))
+    clock = FakeClock([4, *[1] * 20])
+    executor = AsyncExecutor(guided, execute=4, pool=clock)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(40):
+            executor.act(torch.zeros(OBSERVATION_DIM))
+            clock.advance()
+    assert 4 in executor.delays
