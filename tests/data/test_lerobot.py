@@ -135,3 +135,18 @@ def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
     expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
     np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
     assert replay.observation_keys == TASKS["lift"].low_dim_keys
+
+
+def test_features_of_width_1_and_of_truth_values(tmp_path):
+    features = {
+        "observation.state": numbers(1),
+        "observation.gripper": {"dtype": "bool", "shape": (1,), "names": None},
+        "observation.contacts": {"dtype": "bool", "shape": (3,), "names": None},
+        "action": numbers(1),
+    }
+    values = write_lerobot(tmp_path / "data", features=features)
+    names = list(features)[:-1]
+    data = LeRobotDemonstrations(tmp_path / "data", observation_keys=names).data
+    expected = np.concatenate([values[name].astype(np.float32) for name in names], -1)
+    np.testing.assert_array_equal(data["observation"].numpy(), expected)
+    np.testing.assert_array_equal(data["action"].numpy(), values["action"])

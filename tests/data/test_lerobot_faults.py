@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 
+import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("lerobot")
 
@@ -79,8 +81,48 @@ def described(**content):
 ALIEN = {"format": 1, "env_args": {"env_name": "Lift", "env_kwargs": {}}}
 STATE = {"object": ["observation.environment_state", 0, 10]}
 
+HUGE = "data/{chunk_index:2000000000}/{file_index}.parquet"
+
+
+def v21(root):
+    """What a folder of v2.1 has in the place of tables."""
+    info(lambda i: i.update(codebase_version="v2.1"))(root)
+    (root / "meta" / "tasks.parquet").unlink()
+    (root / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": "lift"}')
+
+
+def info_of(name, value):
+    return info(lambda i: i.update({name: value}))
+
+
+MALFORMED = {
+    "features": info_of("features", ["action"]),
+    "features.action": info(lambda i: i["features"].update(action=[7])),
+    "features.action.dtype": feature("action", dtype=32),
+    "features.action.shape": feature("action", shape="7"),
+    "features.action.names": feature("action", names=7),
+    "features.observation.state.shape": feature("observation.state", shape=[9.5]),
+    "features.observation.state.info": feature("observation.state", info=[True]),
+    "fps": info_of("fps", "fast"),
+    "data_path": info_of("data_path", HUGE),
+    "video_path": info_of("video_path", "{video_key.__class__}/{chunk_index}"),
+    "codebase_version": info_of("codebase_version", 3),
+}
+TEMPLATES = ["{chunk_index!r:>9}", "{chunk_index:{file_index}}", "{0}", "{other}", "{chunk_index", 7]
+PLACED = "warmprior.json: observations is"
+
 META = {
-    "v2": (info(lambda i: i.update(codebase_version="v2.1")), ["2.1", "convert_dataset_v21_to_v30"]),
+    "v2.1": (v21, ["LeRobotDataset v2.1", "convert_dataset_v21_to_v30"]),
+    **{name: (change, [f"meta/info.json has {name}="]) for name, change in MALFORMED.items()},
+    **{f"at {text}": (info_of("data_path", text), ["has data_path="]) for text in TEMPLATES},
+    "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["has its content=[]"]),
+    "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
+    "no length": (table(EPISODES, length=entry(0, None, None)), ["numbers of at least 0 as length"]),
+    "no observations": (described(), [PLACED]),
+    "listed observations": (described(observations=["object"]), [PLACED]),
+    "two ends": (described(observations={"object": ["observation.environment_state", 10]}), [PLACED]),
+    "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), [PLACED]),
+    "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json: masks is"]),
     "no JSON": (cut("meta/info.json"), ["LeRobot cannot read", "again"]),
     "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps is 30", "Lift", "20 Hz", "resample"]),
@@ -145,6 +187,37 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
         LeRobotDemonstrations(root, env_args=LIFT, image_keys=keys)
     for word in [str(root / DATA if name in VALUES else root), *said]:
         assert word in str(caught.value)
+
+
+def test_masks_and_episodes_are_some_of_those_that_there_are(root):
+    described(observations=STATE, masks={"none": [], "more": [0, 3], "floats": [0.5], "ok": [2, 0]})(root)
+    seen = {"observation_keys": ["observation.state"]}
+    for name in ("none", "more", "floats"):
+        with pytest.raises(DatasetError, match=rf"the mask '{name}' must be some of the episodes 0 to 2"):
+            LeRobotDemonstrations(root, filter_key=name, **seen)
+    assert LeRobotDemonstrations(root, filter_key="ok", **seen).num_episodes == 2
+    for numbers in ([], [3], [-1], [True], ["0"]):
+        with pytest.raises(DatasetError, match="episodes must be some of the episodes 0 to 2"):
+            LeRobotDemonstrations(root, episodes=numbers, **seen)
+
+
+def test_files_of_other_episodes_are_not_needed(tmp_path):
+    values = write_lerobot(tmp_path / "data", (12, 12, 12), data_files_size_in_mb=0.001)
+    (tmp_path / "data/data/chunk-000/file-001.parquet").unlink()
+    data = LeRobotDemonstrations(tmp_path / "data", episodes=[2, 0]).data
+    assert torch.equal(data["action"], torch.from_numpy(np.delete(values["action"], range(12, 24), 0)))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "shape", "said"),
+    [("float32", (2, 3), "shape [2, 3]"), ("string", (1,), "dtype string")],
+)
+def test_observations_that_are_no_vectors_are_named(tmp_path, dtype, shape, said):
+    write_lerobot(tmp_path / "data")
+    feature("observation.state", dtype=dtype, shape=list(shape))(tmp_path / "data")
+    with pytest.raises(DatasetError, match=r"'observation\.state' has dtype") as caught:
+        LeRobotDemonstrations(tmp_path / "data", observation_keys=["observation.state"])
+    assert said in str(caught.value)
 
 
 def test_bad_options(root):

@@ -157,6 +157,7 @@ class LeRobotDemonstrations(DemonstrationReplay):
         image_keys: images to read as well: ``"agentview_image"`` is the feature
             ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
             are many.
+        episodes: numbers of the episodes to read; all by default. No file of others is needed.
         filter_key: a mask of the converted file; for this, ``demos``, ``absolute_actions`` and ``**kwargs``
             see :class:`RobomimicDemonstrations`.
 
@@ -186,6 +187,7 @@ class LeRobotDemonstrations(DemonstrationReplay):
         env_args: Mapping[str, Any] | None = None,
         filter_key: str | None = None,
         demos: int | None = None,
+        episodes: Sequence[int] | None = None,
         observation_keys: Sequence[str] | None = None,
         image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
@@ -200,13 +202,18 @@ class LeRobotDemonstrations(DemonstrationReplay):
             image_keys=image_keys,
             poses=absolute_actions,
             demos=demos,
+            episodes=episodes,
             env_args=env_args,
         )
         super().__init__(index, LeRobotReader(index), absolute_actions=absolute_actions, **kwargs)
 
 
 def lerobot_steps(
-    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",), *, demos: int | None = None
+    dataset: str | Path,
+    observation_keys: Sequence[str] = ("observation.state",),
+    *,
+    demos: int | None = None,
+    episodes: Sequence[int] | None = None,
 ) -> TensorDictBase:
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 
@@ -214,6 +221,7 @@ def lerobot_steps(
         dataset: its folder, or ``user/name`` of its repository at the hub.
         observation_keys: features that make the observation, concatenated in this order.
         demos: how many demonstrations to read, from the first on; all of them by default.
+        episodes: numbers of the episodes to read; all of them by default.
 
     Returns:
         ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``, as
@@ -231,5 +239,6 @@ def lerobot_steps(
         >>> steps["action"].shape  # doctest: +SKIP
         torch.Size([25650, 2])
     """
-    data = LeRobotDemonstrations(dataset, observation_keys=observation_keys, demos=demos).data
+    chosen: dict[str, Any] = {"demos": demos, "episodes": episodes}
+    data = LeRobotDemonstrations(dataset, observation_keys=observation_keys, **chosen).data
     return data.select(OBSERVATION, ACTION, EPISODE)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 from warmprior.data.replay import (
@@ -117,11 +119,22 @@ def _metadata(root: Path) -> Any:
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
     again = "Copy, download, record or convert it again."
+    try:
+        version = _check_info(read_json(root / "meta" / "info.json"))
+    except ValueError as error:
+        raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
+    if version != LEROBOT_VERSION:
+        raise DatasetError(
+            f"{root} is a LeRobotDataset {version}, and {LEROBOT_VERSION} is needed: convert one of v2.1 by "
+            "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=USER/NAME"
+        )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
         if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
             raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
     try:
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+        whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
+        _check_columns(metadata, whole)
     except Exception as error:  # of json, pyarrow, datasets and LeRobot itself
         raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
@@ -132,6 +145,66 @@ def _metadata(root: Path) -> Any:
             f"{len(numbers)} of {steps}. {again}"
         )
     return metadata
+
+
+_PLACES = {
+    "data_path": ("chunk_index", "file_index"),
+    "video_path": ("video_key", "chunk_index", "file_index"),
+}
+
+
+def _is_template(path: str, fields: Sequence[str]) -> bool:
+    """Whether a text is a path with places for names and numbers: a format may be of any length."""
+    try:
+        places = [part[1:] for part in Formatter().parse(path) if part[1] is not None]
+    except ValueError:
+        return False
+    plain = re.compile(r"(0?\d{1,2}d?)?")
+    return all(field in fields and not how and plain.fullmatch(spec or "") for field, spec, how in places)
+
+
+def _check_info(info: Any) -> str:
+    """Check what is used of ``meta/info.json``, and return its version; a ``ValueError`` names the entry."""
+
+    def need(name: str, value: Any, good: bool) -> None:
+        if not good:
+            raise ValueError(f"meta/info.json has {name}={str(value)[:80]}")
+
+    need("its content", info, isinstance(info, dict))
+    version, features, fps = (info.get(name) for name in ("codebase_version", "features", "fps"))
+    need("codebase_version", version, isinstance(version, str))
+    need("fps", fps, isinstance(fps, int | float) and fps > 0)
+    need("features", features, isinstance(features, dict))
+    for name, feature in features.items():
+        need(f"features.{name}", feature, isinstance(feature, dict))
+        dtype, shape = feature.get("dtype"), feature.get("shape")
+        need(f"features.{name}.dtype", dtype, isinstance(dtype, str))
+        whole = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
+        need(f"features.{name}.shape", shape, whole)
+        for part, kinds in {"names": (list, dict), "info": (dict,), "video_info": (dict,)}.items():
+            value = feature.get(part)
+            need(f"features.{name}.{part}", value, value is None or isinstance(value, kinds))
+    for name, fields in _PLACES.items():
+        if (path := info.get(name)) is not None:  # LeRobot's own by default
+            need(name, path, isinstance(path, str) and _is_template(path, fields))
+    return version
+
+
+def _check_columns(metadata: Any, names: Sequence[str]) -> None:
+    """A ``ValueError`` unless ``meta/episodes`` has columns of whole numbers of at least 0."""
+    for name in names:
+        values = metadata.episodes[name] if name in metadata.episodes.column_names else [None]
+        if not all(type(value) is int and value >= 0 for value in values):
+            raise ValueError(f"meta/episodes has no whole numbers of at least 0 as {name}")
+
+
+def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
+    """Check numbers of episodes, and return them in order, each once."""
+    if not numbers or any(type(number) is not int or not 0 <= number < count for number in numbers):
+        raise DatasetError(
+            f"{root}: {what} must be some of the episodes 0 to {count - 1}, got {list(numbers)}"
+        )
+    return sorted(set(numbers))
 
 
 def action_names(arms: int) -> list[str]:
@@ -162,6 +235,7 @@ def read_lerobot_index(
     image_keys: Sequence[str] = (),
     poses: bool = False,
     demos: int | None = None,
+    episodes: Sequence[int] | None = None,
     env_args: Mapping[str, Any] | None = None,
 ) -> LeRobotIndex:
     """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
@@ -182,7 +256,7 @@ def read_lerobot_index(
     widths = {
         name: feature["shape"][0]
         for name, feature in metadata.features.items()
-        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
+        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint", "bool"))
     }
     if "action" not in widths:
         raise unknown(root, "vector of numbers", "action", widths)
@@ -200,6 +274,11 @@ def read_lerobot_index(
     for key in [*observation_keys, *(pose_keys(widths["action"]) if poses else ())]:
         if key in metadata.camera_keys:
             raise DatasetError(f"{root}: {key!r} is an image, not a vector: name it in image_keys")
+        if key not in columns and (feature := metadata.features.get(key)):
+            raise DatasetError(
+                f"{root}: {key!r} has dtype {feature['dtype']} and shape {list(feature['shape'])}, and "
+                "observations are vectors of numbers: leave it out, or write one that is"
+            )
         if key not in columns:
             raise unknown(root, "observation", key, columns)
     cameras = {
@@ -207,18 +286,21 @@ def read_lerobot_index(
         for name in metadata.camera_keys
         if name not in metadata.depth_keys
     }
-    episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    if episodes is not None:
+        rows = [rows[number] for number in _chosen(root, "episodes", episodes, len(rows))]
     if filter_key is not None:
         masks = described.get("masks", {})
         if filter_key not in masks:
             raise unknown(root, "filter key", filter_key, masks)
-        episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
-    check_count(root, demos, len(episodes))
-    episodes = episodes[:demos]
+        chosen = _chosen(root, f"the mask {filter_key!r}", masks[filter_key], len(rows))
+        rows = [row for row in rows if row["episode_index"] in chosen]
+    check_count(root, demos, len(rows))
+    rows = rows[:demos]
     index = LeRobotIndex(
         path=root,
-        demos=tuple(str(row["episode_index"]) for row in episodes),
-        lengths=tuple(row["length"] for row in episodes),
+        demos=tuple(str(row["episode_index"]) for row in rows),
+        lengths=tuple(row["length"] for row in rows),
         observation_keys=tuple(observation_keys),
         observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observation_keys),
         image_keys=tuple(image_keys),
@@ -228,11 +310,23 @@ def read_lerobot_index(
         env_args=recorded,
         task=task,
         metadata=metadata,
-        episodes=tuple(episodes),
+        episodes=tuple(rows),
         columns=columns,
         images={key: cameras[key] for key in image_keys},
         described=described,
     )
+    try:
+        _check_columns(
+            metadata,
+            [
+                f"videos/{name}/{part}_index"
+                for name in index.images.values()
+                if name in metadata.video_keys
+                for part in ("chunk", "file")
+            ],
+        )
+    except ValueError as error:
+        raise DatasetError(f"{root}: {error}: download or convert it again") from error
     if fetch and remote and not all((root / file).is_file() for file in index.files):
         index = replace(index, path=download_lerobot(str(dataset), index.files, revision=revision))
     return index
@@ -246,12 +340,22 @@ def _description(root: Path) -> dict[str, Any]:
         description = read_json(path)
     except ValueError as error:
         raise DatasetError(f"{error}. Convert the file again.") from error
-    if not (
-        isinstance(description, dict) and description.get("format") == 1 and "observations" in description
-    ):
+    if not (isinstance(description, dict) and description.get("format") == 1):
         raise DatasetError(f"{path} is not of this version: convert the file again, or remove it")
+    observations, masks = description.get("observations"), description.get("masks", {})
+    for name, value, good in (
+        ("observations", observations, _is_place),
+        ("masks", masks, lambda numbers: isinstance(numbers, list)),
+    ):
+        if not (isinstance(value, dict) and all(map(good, value.values()))):
+            raise DatasetError(f"{path}: {name} is {str(value)[:80]}: convert the file again, or remove it")
     check_env_args(f"{path}: env_args", description.get("env_args"))
     return description
+
+
+def _is_place(value: Any) -> bool:
+    """Whether a value says where in a feature an observation is."""
+    return isinstance(value, list) and [type(part) for part in value] == [str, int, int]
 
 
 def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], what: str) -> None:
