@@ -410,7 +410,7 @@ class Longer(PreviewPrior):
     """Remembers more than it predicts."""
 
     name = "longer-for-executors"
-    history_length = 11
+    history_length = 17
 
     def __init__(self, chunk_length):
         super().__init__(chunk_length)
@@ -421,18 +421,19 @@ CALLS = 50_000
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:a decision failed")
-@pytest.mark.parametrize("timeout", [0.0, None])
-@pytest.mark.parametrize("prior", [GaussianPrior(4), PastPrior(4), PreviewPrior(4), Longer(3)], ids=str)
-def test_fifty_thousand_calls(prior, timeout):
-    """Whatever is slow, late or fails, actions and histories are those of the steps that were executed."""
+@pytest.mark.parametrize("prior", [GaussianPrior(8), PastPrior(8), PreviewPrior(8), Longer(6)], ids=str)
+def test_fifty_thousand_calls(prior):
+    """Whatever is slow, late or fails, actions and histories are of the steps that were executed.
+
+    Some calls wait, and some do not.
+    """
     length, remembered = prior.prediction_length, prior.history_length
     policy, clock = Told(length), RandomClock(length, seed=0)
-    executor = AsyncExecutor(
-        policy, prior=prior, action_dim=2, execute=2, observation_steps=1, timeout=timeout, pool=clock
-    )
+    executor = AsyncExecutor(policy, prior=prior, action_dim=2, execute=5, observation_steps=1, pool=clock)
     done, errors, held, calls = [], 0, 0, 0
     while calls < CALLS:
         calls += 1
+        executor.timeout = 0.0 if calls // 1000 % 2 else None
         try:
             # The policy is shown how much was executed, which is where its chunk begins.
             action = executor.act(torch.tensor([float(len(done))]))
@@ -454,7 +455,7 @@ def test_fifty_thousand_calls(prior, timeout):
             assert history["forecast"][:left, 1].tolist() == list(range(now, now + left))
             assert not history["forecast"][left:].any()
         policy.given.clear()
-    assert len(done) > CALLS / 2 and errors and (held > 100 or timeout is None)
+    assert len(done) > CALLS / 2 and errors and held
     assert max(executor.delays) > 1
 
 

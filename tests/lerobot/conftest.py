@@ -41,3 +41,16 @@ def policy(built):
         return found.eval()
 
     return get
+
+
+@pytest.fixture(scope="session")
+def found():
+    """The policies' classes, by LeRobot's own discovery."""
+    pytest.importorskip("lerobot_policy_warmprior")
+    pytest.importorskip("transformers")
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    names = ("warm_smolvla", "warm_pi05", "warm_groot", "warm_flow")
+    return {name: get_policy_class(name) for name in names}

@@ -49,7 +49,7 @@ def test_the_preview_is_the_last_forecast(built):
     batch, chunks = observations("smolvla", 2), []
     for decision in range(3):
         with watch("smolvla", made) as seen:
-            chunks.append(adapter.predict_action_chunk(dict(batch)))
+            chunks.append(adapter.predict_action_chunk(dict(batch), executed_steps=every))
         source = seen.x[0][..., :ACTION]
         if decision:
             assert torch.equal(source[:, :half], chunks[-2][:, every : every + half])
@@ -99,7 +99,7 @@ def test_chunks_are_guided_towards_the_rest_of_the_last_one(built, monkeypatch, 
     with pytest.raises(ValueError, match="a delay of 1 control steps needs as many actions"):
         adapter.predict_action_chunk(dict(batch), executed_steps=torch.tensor([LENGTH, 2]), delay=1)
     with pytest.raises(ValueError, match=r"must be a whole number of at least 0, got 0\.5"):
-        adapter.predict_action_chunk(dict(batch), delay=0.5)
+        adapter.predict_action_chunk(dict(batch), executed_steps=1, delay=0.5)
     with pytest.raises(ValueError, match=f"guidance needs n_action_steps below .*{LENGTH}"):
         adapter.select_action(dict(batch))
     with pytest.raises(ValueError, match="guidance is for pi0, pi05 and smolvla"):
@@ -243,7 +243,7 @@ def test_relative_actions_follow_the_state(built):
 
     first = adapter.predict_action_chunk(observed(states[0]))
     with watch("pi0", made) as seen:
-        adapter.predict_action_chunk(observed(states[1]))
+        adapter.predict_action_chunk(observed(states[1]), executed_steps=LENGTH)
     mean, std = stats["action"]["mean"], stats["action"]["std"]
     absolute = first * std + mean + states[0][:, None]
     expected = (absolute - states[1][:, None] - mean) / std
@@ -263,5 +263,9 @@ def test_batches_that_do_not_fit(policy):
     adapter.predict_action_chunk(observations("pi05", 2))
     with pytest.raises(ValueError, match="3 environments follow 2: call reset"):
         adapter.predict_action_chunk(observations("pi05", 3))
+    with pytest.raises(ValueError, match="executed_steps="):
+        adapter.predict_action_chunk(observations("pi05", 2))
     with pytest.raises(ValueError, match="the prior gives noise="):
-        adapter.predict_action_chunk(observations("pi05", 2), noise=torch.zeros(2, LENGTH, 12))
+        adapter.predict_action_chunk(
+            observations("pi05", 2), executed_steps=1, noise=torch.zeros(2, LENGTH, 12)
+        )

@@ -15,7 +15,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import write_lerobot
+from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import (
     ACTION,
@@ -50,16 +50,6 @@ from lerobot.configs.types import NormalizationMode
 
 STATE, OBJECT = 9, 10  # of lift
 VLA = ["warm_smolvla", "warm_pi05", "warm_groot"]
-
-
-@pytest.fixture(scope="module")
-def found():
-    """The policies' classes, by LeRobot's own discovery."""
-    from lerobot.policies.factory import get_policy_class
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    register_third_party_plugins()
-    return {name: get_policy_class(name) for name in (*VLA, "warm_flow")}
 
 
 def warm(found, name, **options):
@@ -138,7 +128,7 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     """Minima and maxima by hand; the chunk is what GR00T's own processors make of it."""
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot.policies.groot import processor_groot
-    from lerobot_policy_warmprior import processor_warm_groot
+    from lerobot_policy_warmprior import loading
     from lerobot_policy_warmprior.processor_warm_groot import check_pretrained
 
     # What encodes images and language is on the hub.
@@ -174,7 +164,7 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     check_pretrained(config, str(tmp_path))
     asked = {}
     monkeypatch.setattr(
-        processor_warm_groot,
+        loading,
         "hf_hub_download",
         lambda *at, **more: asked.update(more) or tmp_path / "policy_preprocessor.json",
     )
@@ -294,6 +284,144 @@ def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
         torch.testing.assert_close(new, old + 0.005)
 
 
+def dataset_policy(found, root, episodes=None, place=None, **options):
+    """As lerobot-train makes it, which names the dataset's metadata alone; and that dataset."""
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.policies.factory import make_policy
+
+    config = found["warm_flow"].config_class(embedding_dim=24, num_layers=1, device="cpu", **options)
+    config.pretrained_path = place
+    dataset = LeRobotDataset("local/tiny", root=root, episodes=episodes)
+    return make_policy(config, ds_meta=dataset.meta), dataset
+
+
+def moments_by_hand(policy, dataset, episodes):
+    """Of some episodes, normalised by the statistics of all, as LeRobot's processors do."""
+    steps = lerobot_steps(dataset.root, policy.config.observed)
+    steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
+    low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
+    steps["action"] = 2 * (steps["action"] - low) / (high - low) - 1
+    network = policy.actor.network
+    sizes = network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
+    return precondition(VelocityMLP(*sizes), steps, policy.actor.prior).moments.state_dict()
+
+
+def test_it_is_preconditioned_for_the_episodes_of_the_training(found, tmp_path):
+    root = tmp_path / "data"
+    write_lerobot(root, (12, 12, 12), data_files_size_in_mb=0.001)
+    for episodes in ([0, 2], None):
+        policy, dataset = dataset_policy(found, root, episodes)
+        expected = moments_by_hand(policy, dataset, episodes or [0, 1, 2])
+        for name, value in expected.items():
+            torch.testing.assert_close(policy.actor.network.moments.state_dict()[name], value)
+    (root / "data/chunk-000/file-001.parquet").unlink()
+    dataset_policy(found, root, [0, 2])
+
+
+def test_a_training_that_goes_on_has_the_moments_of_its_own_data(found, tmp_path):
+    for name, seed in (("one", 0), ("two", 1)):
+        write_lerobot(tmp_path / name, (12, 12, 12), seed=seed)
+    first, _ = dataset_policy(found, tmp_path / "one")
+    first.update()
+    first.save_pretrained(tmp_path / "policy")
+    again, dataset = dataset_policy(found, tmp_path / "two", place=tmp_path / "policy")
+    expected = moments_by_hand(again, dataset, [0, 1, 2])
+    old = first.actor.network.moments.state_dict()
+    for network in (again.actor.network, again.averaged.module):
+        for name, value in expected.items():
+            torch.testing.assert_close(network.moments.state_dict()[name], value)
+    assert not torch.equal(expected["target_mean"], old["target_mean"])
+    weights = dict(first.actor.network.network.named_parameters())
+    assert all(torch.equal(v, weights[n]) for n, v in again.actor.network.network.named_parameters())
+    # Without a training it has its own; another source is for trainings alone.
+    saved = found["warm_flow"].from_pretrained(tmp_path / "policy")
+    assert torch.equal(saved.actor.network.moments.target_mean, old["target_mean"])
+    dataset_policy(found, tmp_path / "two", place=tmp_path / "policy", prior="past,sigma=0.1")
+
+
+def test_a_dataset_without_statistics_is_refused(found, tmp_path):
+    write_lerobot(tmp_path / "data", (12, 12))
+    (tmp_path / "data/meta/stats.json").unlink()
+    with pytest.raises(ValueError, match=r"meta/stats\.json lacks .*action: min, action: max"):
+        dataset_policy(found, tmp_path / "data", precondition=False)
+
+
+def test_features_of_width_1(found, tmp_path):
+    """As LeRobotDataset and its loader give them, without that dimension."""
+    from lerobot.datasets import LeRobotDataset
+    from torch.utils.data import default_collate
+
+    write_lerobot(tmp_path / "data", (12, 12), {name: numbers(1) for name in ("observation.state", "action")})
+    policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4)
+    config = policy.config
+    deltas = {"action": config.action_delta_indices, "observation.state": config.observation_delta_indices}
+    dataset = LeRobotDataset(
+        "local/tiny",
+        root=tmp_path / "data",
+        delta_timestamps={name: [i / 20 for i in steps] for name, steps in deltas.items()},
+    )
+    batch = default_collate([dataset[i] for i in range(6)])
+    assert batch["action"].ndim == 2
+    loss, _ = policy.forward(batch)
+    loss.backward()
+    assert policy.eval().select_action({"observation.state": torch.zeros(3, 1)}).shape == (3, 1)
+
+
+def test_losses_of_samples(found):
+    policy = flow_policy(found).eval()
+    batch = flow_batch(8)
+    batch["action_is_pad"][1, 5:] = True
+    torch.manual_seed(5)
+    mean, _ = policy.forward(batch)
+    torch.manual_seed(5)
+    losses, said = policy.forward(batch, reduction="none")
+    count = torch.tensor([4.0, 1.0, 4.0])
+    assert losses.shape == (3,) and losses.grad_fn is not None
+    torch.testing.assert_close((losses * count).sum() / count.sum(), mean)
+    assert said["flow_matching"] == pytest.approx(losses.mean().item())
+    assert policy.forward(batch)[0].ndim == 0
+    with pytest.raises(ValueError, match="reduction must be one of mean, none"):
+        policy.forward(batch, reduction="sum")
+
+
+@pytest.mark.parametrize("prior", ["past,sigma=0.0", "preview,sigma=0.0"])
+def test_fewer_actions_are_executed_than_remembered(found, prior, tmp_path):
+    flow_policy(found, prior=prior).save_pretrained(tmp_path)
+    config = found["warm_flow"].config_class.from_pretrained(tmp_path, cli_overrides=["--n_action_steps=3"])
+    policy = found["warm_flow"].from_pretrained(tmp_path, config=config).eval()
+    assert policy.actor.prior.chunk_length == 4
+    sources, chunks = [], []
+    policy.actor.register_forward_hook(lambda module, args, out: sources.append(out["prior", "loc"]))
+    policy.actor.register_forward_hook(lambda module, args, out: chunks.append(out["vla_action", "chunk"]))
+    batch = {"observation.state": torch.randn(2, 3), "observation.environment_state": torch.randn(2, 2)}
+    actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
+    assert len(sources) == 3
+    expected = actions[:, 2:6] if prior.startswith("past") else chunks[1][:, 3:7]
+    assert torch.equal(sources[2][:, :4], expected)
+    with pytest.raises(ValueError, match="n_action_steps must be between 1 and 4, got 5"):
+        flow_policy(found, prior_chunk=4, n_action_steps=5)
+
+
+@pytest.mark.parametrize("name", [*VLA, "warm_flow"])
+def test_another_number_of_environments(found, name):
+    """Also while LeRobot's queue still has actions of the others."""
+    if name == "warm_flow":
+        policy, batches = flow_policy(found), {n: flow_batch(8, n) for n in (2, 3)}
+        batches = {n: {k: v[:, -1] for k, v in b.items() if "obs" in k} for n, b in batches.items()}
+    else:
+        policy = warm(found, name, n_action_steps=4)
+        batches = {n: observations(name.removeprefix("warm_"), n) for n in (2, 3)}
+    policy.eval().reset()
+    policy.select_action(dict(batches[2]))
+    for call in (policy.select_action, policy.predict_action_chunk):
+        with pytest.raises(ValueError, match="3 environments follow 2: call reset"):
+            call(dict(batches[3]))
+    with pytest.raises(TypeError, match="takes no nfe"):
+        policy.select_action(dict(batches[2]), nfe=3)
+    policy.reset()
+    assert len(policy.select_action(dict(batches[3]))) == 3
+
+
 def test_the_flow_policys_loss_is_algorithm_1(found):
     policy = flow_policy(found, prior="past,sigma=0.0", precondition=False).eval()
     batch = flow_batch(8)
@@ -340,7 +468,9 @@ def test_the_flow_policy_remembers(found):
     assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])
     assert actions.abs().max() <= 1
     policy.reset()
-    chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
+    chunks = [policy.predict_action_chunk(dict(batch), executed_steps=4) for _ in range(2)]
+    with pytest.raises(ValueError, match="executed_steps="):
+        policy.predict_action_chunk(dict(batch))
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
     with pytest.raises(ValueError, match="executed_steps must be between 0 and"):

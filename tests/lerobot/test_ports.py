@@ -96,7 +96,7 @@ def test_the_chunk_is_integrated_from_this_source(family, policy):
     else:
         executed = adapter.predict_action_chunk(dict(start))
         with watch(family, made) as seen:
-            chunk = adapter.predict_action_chunk(dict(start))
+            chunk = adapter.predict_action_chunk(dict(start), executed_steps=LENGTH)
         expected = executed
     positions = slice(lead(family), None)
     assert len(seen.x) == STEPS

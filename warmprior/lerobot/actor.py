@@ -185,6 +185,11 @@ class LeRobotActor(TensorDictModuleBase):
         """How a chunk is drawn."""
         return self.ode.sampling
 
+    @property
+    def device(self) -> torch.device:
+        """Where LeRobot's policy is."""
+        return next(self.ode.policy.parameters()).device
+
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:

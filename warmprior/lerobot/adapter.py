@@ -91,6 +91,18 @@ HISTORY = "action_history"
 
 HISTORY_IS_PAD = f"{HISTORY}_is_pad"
 
+LEFT_OVER = "prev_chunk_left_over"
+"""What LeRobot's real-time chunking calls the actions that are left of the last chunk."""
+
+
+def with_width(batch: Mapping[str, Any], widths: Mapping[str, int]) -> dict[str, Any]:
+    """A batch of windows whose features of width 1 have that dimension, which LeRobotDataset leaves out.
+
+    They are ``[B, T]`` there, and ``[B, T, d]`` here.
+    """
+    short = {n: batch[n] for n, width in widths.items() if width == 1 and n in batch and batch[n].ndim == 2}
+    return {**batch, **{name: value.unsqueeze(-1) for name, value in short.items()}}
+
 
 def history_indices(history_length: int, length: int, lead: int = 0) -> list[int]:
     """Dataset steps of a training window, for ``action_delta_indices``.
@@ -190,6 +202,8 @@ class WarmPriorAdapter:
         # Control steps until the chunk under way takes effect; of the last one the rest, how much is left,
         # the delay, and the width of the source, all over the whole chunk.
         self._delay = 0
+        # Actions that predict_action_chunk returned last.
+        self._given = 0
         self._rest: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
@@ -210,7 +224,7 @@ class WarmPriorAdapter:
             ValueError: if the window or its mask has another length, or noise is given.
         """
         check_no_noise(kwargs)
-        before, valid, target, is_pad = self._window(batch)
+        before, valid, target, is_pad = self._window(with_width(batch, {"action": self.source.action_dim}))
         a0 = self.source.learn(before, valid, target, self.generator, self.cold_probability)
         inputs = dict(batch)
         for name in (HISTORY, HISTORY_IS_PAD):
@@ -241,6 +255,7 @@ class WarmPriorAdapter:
         steps, length = self.policy.config.n_action_steps, self.prior.prediction_length
         if self.guidance is not None and steps >= length:
             raise ValueError(f"guidance needs n_action_steps below the chunk's {length}, got {steps}")
+        self._expect(batch)
         with self._from_source():
             action = (self.policy.select_action if select is None else select)(batch, **kwargs)
         self._memory.step()
@@ -254,30 +269,34 @@ class WarmPriorAdapter:
         delay: int = 0,
         **kwargs: Any,
     ) -> Tensor:
-        """A new chunk, ``[B, T', d_a]`` in the model's units.
+        """A new chunk, ``[B, T', d_a]`` in the model's units, of no more actions than the prior predicts.
 
-        With a delay its first actions are the rest of the last chunk, which is executed meanwhile.
+        With a delay its first actions are the rest of the last chunk, which is executed meanwhile. What
+        LeRobot's real-time chunking passes, ``prev_chunk_left_over=`` and ``inference_delay=``, tells both:
+        how many actions of the last chunk were executed, and the delay.
 
         Args:
             batch: a preprocessed observation.
             executed_steps: actions executed of the last chunk: a number, for all environments that were not
-                reset since, or ``[B]``; by default the policy's ``n_action_steps``, or as many as
-                :meth:`select_action` returned.
+                reset since, or ``[B]``; by default as many as :meth:`select_action` returned.
             predict: the policy's ``predict_action_chunk`` by default.
             delay: control steps until the chunk takes effect.
             kwargs: handed to it.
 
         Raises:
-            ValueError: see :meth:`select_action`; also if more actions were executed than are remembered, or
-                fewer are left of the last chunk than the delay needs.
+            ValueError: see :meth:`select_action`; also if nothing tells how many actions were executed, what
+                is left over is no part of the last chunk, more were executed than a chunk has, or fewer are
+                left than the delay needs.
         """
         call = self.policy.predict_action_chunk if predict is None else predict
         if self._sampling:  # on the way from select_action
             return call(batch, **kwargs)
+        self._expect(batch)
         if executed_steps is not None:
             self._memory.executed(executed_steps)
-        elif self._memory.waits:
-            self._memory.executed(self.policy.config.n_action_steps)
+        elif LEFT_OVER in kwargs:
+            left = self._memory.left_over(kwargs[LEFT_OVER], self._given)
+            delay = min(kwargs.get("inference_delay") or 0, left)
         check_whole_numbers(0, delay=delay)
         self._delay = delay
         try:
@@ -285,7 +304,9 @@ class WarmPriorAdapter:
                 chunk = call(batch, **kwargs)
         finally:
             self._delay = 0
-        return self._spliced(chunk)
+        chunk = self._spliced(chunk)[:, : self.prior.prediction_length]
+        self._given = chunk.shape[1]
+        return chunk
 
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
@@ -307,6 +328,12 @@ class WarmPriorAdapter:
     def forget(self, mask: Tensor | None = None) -> None:
         """As :meth:`reset`, without resetting the policy."""
         self._memory.forget(mask)
+
+    def _expect(self, batch: Mapping[str, Any]) -> None:
+        """Refuse other environments, also while LeRobot's queue has actions of the last ones."""
+        state = next((batch[name] for name in ("observation.state", "state") if name in batch), None)
+        if state is not None:
+            self._memory.expect(len(state))
 
     @contextmanager
     def aside(self) -> Iterator[None]:

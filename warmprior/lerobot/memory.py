@@ -7,9 +7,10 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import pad
 
 from warmprior.checks import check_between, check_shape
-from warmprior.history import advance, cold_history, without
+from warmprior.history import caught_up, cold_history, without
 from warmprior.modules.prior import Prior
 
 
@@ -30,6 +31,8 @@ class ActionMemory:
         # The history of the decision under way counts once there is a chunk, since a sampler may fail.
         self._history = self._decision = TensorDict()
         self._executed = self._new = torch.empty(0)
+        # Whether it is known how many actions of the chunk were executed.
+        self._counted = False
 
     def decide(
         self,
@@ -39,17 +42,21 @@ class ActionMemory:
     ) -> TensorDict:
         """The history ``[B]`` at the next decision; ``move`` expresses actions of the last one, at this one.
 
-        A ``ValueError`` if there are other environments than before.
+        A ``ValueError`` if there are other environments than before, or nobody told what was executed.
         """
+        self.expect(batch_size)
         if self._chunk is None:
             self.began = torch.ones(batch_size, dtype=torch.bool, device=device)
             lengths = self.prior.history_length, self.prior.prediction_length
             history = cold_history([batch_size], *lengths, self.action_dim, device=device)
-        elif len(self._chunk) != batch_size:
-            raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
+        elif not self._counted:
+            raise ValueError(
+                "how many actions of the last chunk were executed is not known: give executed_steps= to "
+                "predict_action_chunk, or prev_chunk_left_over= as LeRobot's real-time chunking does"
+            )
         else:
             self.began = self._new
-            history = advance(self._history, self._chunk, self._executed)
+            history = caught_up(self._history, self._chunk, self._executed)
             # The rest of the chunk belongs to an episode that is over.
             cold = without(history, self._new)
             history.update(cold.select("forecast", "forecast_steps"))
@@ -68,18 +75,45 @@ class ActionMemory:
         self._chunk = chunk.detach().to(self._history["forecast"], copy=True)
         self._executed = torch.zeros_like(self._history["steps"])
         self._new = torch.zeros_like(self._executed[:, 0], dtype=torch.bool)
+        self._counted = False
+
+    def expect(self, batch_size: int) -> None:
+        """Raise ValueError if a chunk is of other environments."""
+        if self._chunk is not None and len(self._chunk) != batch_size:
+            raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
 
     def step(self) -> None:
         """One more action of the chunk is executed."""
-        self._executed = self._executed + 1
+        self._executed, self._counted = self._executed + 1, True
 
-    @property
-    def waits(self) -> bool:
-        """Whether there is a chunk of which no action was executed yet."""
-        return self._chunk is not None and not self._executed.any()
+    def left_over(self, rest: Tensor | None, given: int) -> int:
+        """Count what was executed by what is left of the chunk, and return how much that is, at the least.
+
+        Of the chunk so many actions were ``given``. The rest is ``[B, n, d_a]``, or ``[n, d_a]`` of one
+        environment: any number of actions from the next one on, with zeros behind the last. ``None`` stands
+        for a new episode, as in LeRobot's rollouts. A ``ValueError`` if the chunk has no such part.
+        """
+        if rest is None:
+            self.forget()
+        if rest is None or self._chunk is None:
+            return 0
+        rest = (rest if rest.ndim == 3 else rest[None])[..., : self.action_dim].to(self._chunk)
+        count = rest.shape[1]
+        line = pad(self._chunk[:, :given], (0, 0, 0, count))
+        first = 0 if count else given
+        same = [(line[:, k : k + count] == rest).flatten(1).all(1) for k in range(first, given + 1)]
+        begins = torch.stack(same, 1)
+        if not begins.any(1).all():
+            raise ValueError(
+                "prev_chunk_left_over is no part of the last chunk, so what was executed is not known: give "
+                "executed_steps=, or reset() for a new episode"
+            )
+        executed = first + begins.int().argmax(1)
+        self.executed(executed)
+        return given - int(executed.max())
 
     def executed(self, steps: int | Tensor) -> None:
-        """Set how many actions of the chunk were executed, from 0 to ``chunk_length``.
+        """Set how many actions of the chunk were executed, from 0 to ``prediction_length``.
 
         A number is for all environments whose episode goes on; ``[B]`` counts a new episode's own actions.
         """
@@ -87,9 +121,10 @@ class ActionMemory:
             return
         count = torch.as_tensor(steps, device=self._executed.device)
         for number in count.flatten().tolist():
-            check_between(0, self.prior.chunk_length, executed_steps=number)
+            check_between(0, self.prior.prediction_length, executed_steps=number)
         counted = self._new[:, None] & (count.ndim == 0)
         self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
+        self._counted = True
 
     def correct(self, action: Tensor) -> None:
         """Replace the action executed last by this one, ``[B, d_a]``; a ``ValueError`` if there is none."""
@@ -106,7 +141,7 @@ class ActionMemory:
             rows = torch.as_tensor(mask, dtype=torch.bool, device=self._new.device)
             check_shape("mask of environments", rows, self._new.shape)
             # The rest of the chunk is still executed, as the first actions of the new episode.
-            rest = advance(self._history, self._chunk, self._executed)["forecast"]
+            rest = caught_up(self._history, self._chunk, self._executed)["forecast"]
             self._chunk = torch.where(rows[:, None, None], rest, self._chunk)
             self._history = without(self._history, rows)
             self._executed = self._executed.masked_fill(rows[:, None], 0)

@@ -28,6 +28,7 @@ class ChunkSource:
         self.port = port_for(policy)
         self.length, self.width = self.port.length(policy), self.port.width(policy)
         self.lead, self.action_dim = self.port.lead(policy), policy.config.action_feature.shape[0]
+        self.observation_steps = policy.config.n_obs_steps
         self.prior, self._std = prior, std
         room = self.length - self.lead
         if prior.prediction_length > room:

@@ -10,7 +10,7 @@ from typing import Any
 
 from warmprior.modules.registry import Registered, kind, registered
 
-__all__ = ["find", "make", "options_of"]
+__all__ = ["build", "find", "make", "options_of"]
 
 
 def find[T: Registered](base: type[T], name: str) -> type[T]:
@@ -35,7 +35,8 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
     """Build what a user typed: a name as for :func:`find`, and options behind it, as in :func:`options_of`.
 
     ``args`` are further arguments of the constructor. A ``ValueError`` names what is wrong and what the
-    constructor takes.
+    constructor takes. Of a text that may come from a file, look the name up by :func:`registered`, which
+    imports nothing, and pass its class to :func:`build`.
 
     Examples:
         >>> from warmprior.modules.option_text import make
@@ -43,7 +44,12 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
         >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
     """
-    cls, options = find(base, text.partition(",")[0]), options_of(text)
+    return build(find(base, text.partition(",")[0]), text, *args)
+
+
+def build[T: Registered](cls: type[T], text: str, *args: Any) -> T:
+    """Build an object of a class with the options behind a name; otherwise as :func:`make`."""
+    options = options_of(text)
     try:
         return cls(*args, **options)
     except (TypeError, ValueError, ArithmeticError) as error:

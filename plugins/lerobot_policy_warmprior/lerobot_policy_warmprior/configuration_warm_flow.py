@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
@@ -11,9 +12,12 @@ from lerobot.optim.schedulers import LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
 from warmprior import Prior
+from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
-from warmprior.modules.option_text import make
+from warmprior.modules.option_text import build
+from warmprior.modules.registry import registered
 from warmprior.training import warmup_cosine
 
 
@@ -39,7 +43,8 @@ class WarmFlowConfig(PreTrainedConfig):
 
     Attributes:
         n_obs_steps: ``To``, observations per decision.
-        n_action_steps: ``H``, actions executed per decision, and remembered by the prior.
+        n_action_steps: actions executed per decision, at most ``H``.
+        prior_chunk: ``H``, the actions that the prior remembers; by default those that are executed.
         prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
@@ -58,6 +63,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     n_obs_steps: int = 2
     n_action_steps: int = 8
+    prior_chunk: int | None = None
     prior: str = "past"
     cold_probability: float = 0.0
     nfe: int = 9
@@ -84,9 +90,26 @@ class WarmFlowConfig(PreTrainedConfig):
     optimizer_weight_decay: float = 1e-5
     scheduler_warmup_ratio: float = 0.2
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.prior_chunk is None:  # and it is saved: fewer can be executed later
+            self.prior_chunk = self.n_action_steps
+
     def make_prior(self) -> Prior:
         """The source distribution; a ``ValueError`` if there is none of that name and these options."""
-        return make(Prior, self.prior, self.n_action_steps)
+        return build(
+            registered(Prior, self.prior.partition(",")[0], OWN_PRIORS), self.prior, self.prior_chunk
+        )
+
+    def meaning(self, *, training: bool) -> dict[str, Any]:
+        """Options without which saved weights mean something else; a training may change the source."""
+        names = "n_obs_steps precondition network embedding_dim num_layers num_heads image_size crop_size"
+        return {
+            **{name: getattr(self, name) for name in (*names.split(), "normalization_mapping")},
+            "input_features": [*self.observed, *self.image_features],
+            "encoder": self.encoder.partition("-")[0],
+            "prior": None if training else self.make_prior().config(),
+        }
 
     @property
     def observed(self) -> list[str]:
@@ -115,6 +138,7 @@ class WarmFlowConfig(PreTrainedConfig):
             raise ValueError("warm_flow needs observation.state or observation.environment_state")
         if self.action_feature is None:
             raise ValueError("warm_flow needs the feature 'action'")
+        check_between(1, self.make_prior().chunk_length, n_action_steps=self.n_action_steps)
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """The paper's AdamW."""

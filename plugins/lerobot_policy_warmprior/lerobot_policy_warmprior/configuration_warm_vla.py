@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
@@ -10,7 +11,14 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
-from warmprior.modules.option_text import find, make
+from warmprior.modules.option_text import build
+from warmprior.modules.registry import registered
+
+OWN_PRIORS = (
+    "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and beside --policy.path by "
+    "--env.discover_packages_path=PACKAGE"
+)
+"""How a prior gets its name: the option is read from files too, and imports nothing."""
 
 
 @dataclass
@@ -33,9 +41,16 @@ class WarmConfigMixin:
 
     def make_prior(self) -> Prior:
         """The source distribution; a ``ValueError`` if there is none of that name and these options."""
-        kind = find(Prior, self.prior.partition(",")[0])
+        kind = registered(Prior, self.prior.partition(",")[0], OWN_PRIORS)
         room = len(super().action_delta_indices) // kind.prediction_chunks
-        return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)
+        return build(kind, self.prior, room if self.prior_chunk is None else self.prior_chunk)
+
+    def meaning(self, *, training: bool) -> dict[str, Any]:
+        """Options without which saved weights mean something else; a training may change the source."""
+        if training:
+            return {}
+        unit = {"sigma_unit": self.sigma_unit, "action_std": self.action_std}
+        return {"prior": self.make_prior().config(), **unit}
 
     @property
     def action_delta_indices(self) -> list[int]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from collections import deque
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode
+from lerobot.datasets import LeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
 from lerobot.processor import NormalizerProcessorStep, TransitionKey
@@ -16,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
+from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
 from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
@@ -28,34 +32,53 @@ from warmprior import (
     WithheldHistory,
     keys,
 )
+from warmprior.checks import check_choice
 from warmprior.data import lerobot_steps
 from warmprior.history import window_history
+from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition
 
 
-class WarmFlowPolicy(PreTrainedPolicy):
+def training_episodes(meta: Any) -> list[int] | None:
+    """Numbers of the episodes that a training reads; ``None`` for all.
+
+    LeRobot gives a policy the metadata, which is of all episodes: only its dataset, which holds them, knows.
+    """
+    holders = (o for o in gc.get_objects() if isinstance(o, LeRobotDataset) and o.meta is meta)
+    dataset = next(holders, None)
+    return None if dataset is None else dataset.episodes
+
+
+class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
 
-    A training's ``dataset_meta`` is the dataset to which the preconditioning is fitted. A ``ValueError`` if
-    the network does not fit it, or the prior has networks of its own, which LeRobot would not train.
+    A training's ``dataset_meta`` is of the dataset to whose training episodes the preconditioning is fitted,
+    also where it goes on from a saved policy. A ``ValueError`` if the network does not fit it, it has no
+    statistics, or the prior has networks of its own, which LeRobot would not train.
     """
 
     config_class = WarmFlowConfig
     name = "warm_flow"
 
-    def __init__(self, config: WarmFlowConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
+    def __init__(
+        self, config: WarmFlowConfig, *, dataset_meta: Any = None, dataset_stats: Any = None
+    ) -> None:
         super().__init__(config)
         config.validate_features()
+        if dataset_meta is not None:
+            check_statistics(config, dataset_meta)
         prior = config.make_prior()
         if isinstance(prior, nn.Module):
             raise ValueError(
                 f"prior={config.prior!r} is trained beside the flow: lerobot-train does not; take past, "
                 "preview or gaussian"
             )
-        width = sum(config.input_features[name].shape[0] for name in config.observed)
+        seen = {**config.input_features, **config.output_features}
+        self._widths = {name: seen[name].shape[0] for name in (*config.observed, keys.ACTION)}
+        width = sum(self._widths[name] for name in config.observed)
         self._cameras, encoder = list(config.image_features), None
         if self._cameras:
             size = {"image_size": config.image_size, "crop_size": config.crop_size}
@@ -100,6 +123,9 @@ class WarmFlowPolicy(PreTrainedPolicy):
         self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
+        # A saved policy's moments are those of other data, which were normalised otherwise.
+        fitted = {n: v for n, v in self.state_dict().items() if ".moments." in n}
+        self.__dict__["_fitted"] = {} if dataset_meta is None else {n: v.clone() for n, v in fitted.items()}
         # Of the same weights, so that it is no part of the module and is not saved again.
         self.__dict__["_made"] = None
         self.reset()
@@ -116,7 +142,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 f"the preconditioning is fitted to actions that are normalised by MIN_MAX, not by {mode}: "
                 "choose that, or --policy.precondition=false"
             )
-        steps = lerobot_steps(dataset_meta.root, self.config.observed)
+        episodes = training_episodes(dataset_meta)
+        steps = lerobot_steps(dataset_meta.root, self.config.observed, episodes=episodes)
         # LeRobot's own arithmetic: a dimension that never changes is -1.
         features = {keys.ACTION: self.config.action_feature}
         norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
@@ -128,6 +155,10 @@ class WarmFlowPolicy(PreTrainedPolicy):
             observation_steps=self.config.n_obs_steps,
             withhold=self.config.cold_probability,
         )
+
+    def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
+        """Load weights; moments that were fitted to a training's data stay."""
+        return super().load_state_dict({**state_dict, **self._fitted}, *args, **kwargs)
 
     def update(self) -> None:
         """Average the weights: LeRobot calls it after every step of a training."""
@@ -145,17 +176,22 @@ class WarmFlowPolicy(PreTrainedPolicy):
         prior = self.actor.prior
         self.__dict__["_memory"] = ActionMemory(prior, self.config.action_feature.shape[0])
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+    def forward(
+        self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
+    ) -> tuple[Tensor, dict[str, float]]:
         """Conditional flow matching (Algorithm 1).
 
         ``batch`` has ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in
-        front, the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``.
+        front, the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``. The reduction
+        ``"none"`` gives the loss of each sample, ``[B]``, its mean over what is not padded.
         """
+        check_choice("reduction", reduction, ("mean", "none"))
         if "action_is_pad" not in batch:
             raise KeyError(
                 "the batch lacks action_is_pad: the history before an episode is its first action, the "
                 "target, and must be masked"
             )
+        batch = with_width(batch, self._widths)
         prior = self.actor.prior
         lengths = [prior.history_length, prior.prediction_length]
         before, target = batch["action"].split(lengths, dim=1)
@@ -173,8 +209,12 @@ class WarmFlowPolicy(PreTrainedPolicy):
         )
         if self.config.cold_probability > 0:
             data = self._withheld(data)
-        loss = self._loss()(data)["loss_flow_matching"]
-        return loss, {"flow_matching": loss.item()}
+        made = self._loss()
+        made.reduction = reduction
+        loss = made(data)["loss_flow_matching"]
+        if reduction == "none":
+            loss = loss.sum((1, 2)) / (inside.sum(1) * loss.shape[-1]).clamp_min(1)
+        return loss, {"flow_matching": loss.mean().item()}
 
     def _loss(self) -> FlowMatchingLoss:
         """The loss of the weights that the policy has now."""
@@ -190,19 +230,20 @@ class WarmFlowPolicy(PreTrainedPolicy):
         """A new chunk, ``[B, P, d_a]``, normalised.
 
         From present observations ``[B, d]`` and images ``[B, 3, h, w]``, and those since :meth:`reset`.
-        ``executed_steps=`` tells how much of the last chunk was executed, all that is to be by default.
+        ``executed_steps=`` tells how much of the last chunk was executed, by default as much as
+        :meth:`select_action` returned.
         """
         executed = kwargs.pop("executed_steps", None)
+        check_known("predict_action_chunk", kwargs, ["executed_steps"])
         if executed is not None:
             self._memory.executed(executed)
-        elif self._memory.waits:  # asked for chunks alone
-            self._memory.executed(self.config.n_action_steps)
         self._remember(batch)
         return self._chunk()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The next action of every environment, ``[B, d_a]``, normalised."""
+        check_known("select_action", kwargs, [])
         self._remember(batch)
         if not self._queues["action"]:
             self._queues["action"].extend(self._chunk().transpose(0, 1)[: self.config.n_action_steps])
@@ -211,6 +252,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     def _remember(self, batch: dict[str, Tensor]) -> None:
         seen = {name: batch[name] for name in (*self.config.observed, *self._cameras)}
+        self._memory.expect(len(batch[self.config.observed[0]]))
         self._queues = populate_queues(self._queues, seen)
 
     def _chunk(self) -> Tensor:

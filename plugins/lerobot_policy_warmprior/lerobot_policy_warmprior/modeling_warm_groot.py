@@ -7,6 +7,7 @@ from typing import Any, Self
 from lerobot.policies.groot.modeling_groot import GrootPolicy
 
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
+from lerobot_policy_warmprior.loading import HUB
 from lerobot_policy_warmprior.modeling_warm_vla import WarmPolicyMixin
 from lerobot_policy_warmprior.processor_warm_groot import check_pretrained
 
@@ -23,7 +24,6 @@ class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     ) -> Self:
         """A saved policy; a ``ValueError`` if a training that continues it asks for another history."""
         if config is not None and config.pretrained_path:  # LeRobot takes the processors as well
-            names = ("token", "cache_dir", "local_files_only", "force_download")
-            hub = {name: kwargs[name] for name in names if name in kwargs}
+            hub = {name: kwargs[name] for name in HUB if name in kwargs}
             check_pretrained(config, str(pretrained_name_or_path), revision=revision, **hub)
         return super().from_pretrained(pretrained_name_or_path, config=config, revision=revision, **kwargs)

@@ -11,23 +11,35 @@ from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from torch import Tensor
 
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
+from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
 from warmprior.lerobot import WarmPriorAdapter, action_std
+from warmprior.lerobot.adapter import LEFT_OVER
+
+REAL_TIME = ("inference_delay", LEFT_OVER, "execution_horizon")
+"""What LeRobot's real-time chunking passes."""
 
 
-class WarmPolicyMixin:
-    """Comes before a policy of LeRobot: its losses and chunks start from the prior."""
+class WarmPolicyMixin(WholePolicy):
+    """Comes before a policy of LeRobot: its losses and chunks start from the prior.
 
-    def __init__(self, config: Any, *args: Any, dataset_stats: Any = None, **kwargs: Any) -> None:
+    ``dataset_stats`` and ``dataset_meta`` are of a training's dataset, from which ``action_std`` is taken.
+    """
+
+    warm_adapter: Any
+
+    def __init__(self, config: Any, *, dataset_stats: Any = None, dataset_meta: Any = None) -> None:
         if getattr(config, "use_relative_actions", False):
             raise ValueError(
                 "use_relative_actions=true needs the robot's state at both decisions: use "
                 "warmprior.lerobot.WarmPriorAdapter with RelativeActions around the policy"
             )
         self.__dict__["warm_adapter"] = None  # the policy's own constructor resets
-        super().__init__(config, *args, **kwargs)
+        if dataset_meta is not None:
+            check_statistics(config, dataset_meta)
+        super().__init__(config)
         if config.sigma_unit not in ("model", "std"):
             raise ValueError(f"sigma_unit must be 'model' or 'std', got {config.sigma_unit!r}")
-        if config.sigma_unit == "std" and config.action_std is None:
+        if config.sigma_unit == "std" and (config.action_std is None or dataset_meta is not None):
             config.action_std = action_std(self, dataset_stats).tolist()
         std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None
         prior = config.make_prior()
@@ -47,16 +59,28 @@ class WarmPolicyMixin:
 
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of every environment."""
-        return self.warm_adapter.select_action(batch, super().select_action, **kwargs)
+        check_known("select_action", kwargs, ["noise"])
+        return self.warm_adapter.select_action(batch, super().select_action, **kwargs)  # type: ignore[misc]
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """A new chunk; ``executed_steps=`` tells how much of the last one was executed."""
+        """A new chunk; ``executed_steps=`` tells how much of the last one was executed.
+
+        So does ``prev_chunk_left_over=``, which LeRobot's real-time chunking passes.
+        """
         executed = kwargs.pop("executed_steps", None)
-        return self.warm_adapter.predict_action_chunk(batch, executed, super().predict_action_chunk, **kwargs)
+        check_known("predict_action_chunk", kwargs, ["noise", *REAL_TIME])
+        rtc = getattr(self.config, "rtc_config", None)
+        if rtc is not None and not rtc.enabled and LEFT_OVER in kwargs and executed is None:
+            raise ValueError(
+                "with --inference.rtc.enabled=false chunks are executed one after the other, however late, "
+                "so what was executed is not known: turn it on, or take --inference.type=sync"
+            )
+        predict = super().predict_action_chunk  # type: ignore[misc]
+        return self.warm_adapter.predict_action_chunk(batch, executed, predict, **kwargs)
 
     def reset(self) -> None:
         """New episodes in all environments."""
-        super().reset()
+        super().reset()  # type: ignore[misc]
         if self.warm_adapter is not None:
             self.warm_adapter.forget()
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import torch
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import RemoteEntryNotFoundError
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.groot.processor_groot import GrootN17PackInputsStep, make_groot_pre_post_processors
 from lerobot.processor import ProcessorStepRegistry
@@ -17,6 +13,7 @@ from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from torch.nn.functional import pad
 
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
+from lerobot_policy_warmprior.loading import saved_json
 from warmprior.lerobot.adapter import HISTORY, HISTORY_IS_PAD
 
 DATA, PAD = TransitionKey.COMPLEMENTARY_DATA, "action_is_pad"
@@ -85,12 +82,8 @@ def check_pretrained(config: WarmGrootConfig, place: str, **hub: Any) -> None:
     Raises:
         ValueError: if they are GR00T's own, or remember another number of actions.
     """
-    name, folder = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", Path(place)
-    try:
-        file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, **hub))
-        steps = json.loads(file.read_text())["steps"] if file.exists() else []
-    except RemoteEntryNotFoundError:
-        steps = []  # a checkpoint of GR00T itself
+    # A checkpoint of GR00T itself has none.
+    steps = saved_json(place, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", **hub).get("steps", [])
     packs = [step["config"]["history_length"] for step in steps if step.get("registry_name") == STEP]
     length = config.make_prior().history_length
     if not packs:

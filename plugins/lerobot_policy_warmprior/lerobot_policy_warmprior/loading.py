@@ -1,0 +1,145 @@
+"""Saved policies, loaded whole and as what they are, or not at all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from torch import Tensor, nn
+
+from warmprior.io.files import read_json
+
+HUB = ("token", "cache_dir", "local_files_only", "force_download", "proxies", "revision")
+"""Options of a download."""
+
+OLD_BUFFERS = re.compile(r"(un)?normalize_(inputs|targets|outputs)\.")
+"""Of policies that normalised by themselves, before LeRobot had processors."""
+
+STATISTICS = {
+    NormalizationMode.MEAN_STD: ("mean", "std"),
+    NormalizationMode.MIN_MAX: ("min", "max"),
+    NormalizationMode.QUANTILES: ("q01", "q99"),
+    NormalizationMode.QUANTILE10: ("q10", "q90"),
+}
+"""What LeRobot's normalisation needs to know; without it, it silently does nothing."""
+
+
+def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
+    """What a JSON file of a folder, or of a repository of the hub, holds; empty if there is none."""
+    folder = Path(place)
+    try:
+        file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, **hub))
+    except EntryNotFoundError:
+        return {}
+    if not file.exists():
+        return {}
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} has no names and values: choose another policy")
+    return content
+
+
+def check_statistics(config: Any, meta: Any) -> None:
+    """Refuse, by a ``ValueError``, a dataset without the statistics by which a policy normalises."""
+    features, missing = {**config.input_features, **config.output_features}, []
+    for name, feature in features.items():
+        mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
+        known = (meta.stats or {}).get(name, {})
+        missing += [f"{name}: {n}" for n in STATISTICS.get(mode, ()) if n not in known]
+    if missing:
+        raise ValueError(
+            f"{meta.root}/meta/stats.json lacks {', '.join(missing)}: LeRobot would train on raw values. "
+            "Compute it (lerobot-edit-dataset --operation.type=recompute_stats), or change "
+            "--policy.normalization_mapping"
+        )
+
+
+class WholePolicy(nn.Module):
+    """Comes before a policy of LeRobot, whose ``from_pretrained`` leaves random what a file does not hold."""
+
+    config_class: Any
+    name: str
+    _misfit: ClassVar[str | None] = "no model.safetensors"
+
+    def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
+        """Load weights, and remember what does not fit."""
+        own = self.state_dict()
+        loaded = {own[name].data_ptr() for name in own.keys() & state_dict.keys()}
+        wrong = {
+            # Tied weights are in a file once.
+            "missing": [n for n, v in own.items() if n not in state_dict and v.data_ptr() not in loaded],
+            "unexpected": [n for n in state_dict if n not in own and not OLD_BUFFERS.match(n)],
+            "of another shape": [
+                n for n, v in own.items() if n in state_dict and v.shape != state_dict[n].shape
+            ],
+        }
+        said = [
+            f"{len(names)} {what}: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+            for what, names in wrong.items()
+            if names
+        ]
+        self.__dict__["_misfit"] = "; ".join(said) or None
+        return super().load_state_dict(state_dict, *args, **kwargs)
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: Any,
+        *,
+        config: Any = None,
+        cli_overrides: Sequence[str] = (),
+        **kwargs: Any,
+    ) -> Self:
+        """A saved policy, or a checkpoint of its family.
+
+        Raises:
+            ValueError: if weights are missing, unexpected or of another shape, or an option contradicts the
+                saved ones.
+            FileNotFoundError: if there is no such policy.
+        """
+        place = str(pretrained_name_or_path)
+        hub = {name: kwargs[name] for name in HUB if name in kwargs}
+        saved = saved_json(place, "config.json", **hub)
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
+        if saved.get("type") == cls.name:
+            kept = PreTrainedConfig.from_pretrained(place, **hub)
+            check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
+        misfit: str | None
+        try:
+            policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
+            misfit = policy._misfit
+        except RuntimeError as error:
+            if "state_dict" not in str(error):
+                raise
+            misfit = str(error)  # names the weights
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{place} holds no policy: {error}") from error
+        if misfit == WholePolicy._misfit:
+            raise FileNotFoundError(f"{place} has no model.safetensors: choose the folder of a saved policy")
+        if misfit:
+            raise ValueError(
+                f"the weights in {place} are not those of {cls.name} with these options: {misfit}. Leave out "
+                "options that change the network, or choose another policy"
+            )
+        return policy
+
+
+def check_options(place: str, saved: Any, given: Any, *, training: bool) -> None:
+    """Raise ValueError if options contradict those that a saved policy was trained with."""
+    before, now = (config.meaning(training=training) for config in (saved, given))
+    changes = [f"{name}={now[name]!r} (it has {before[name]!r})" for name in now if now[name] != before[name]]
+    if changes:
+        raise ValueError(f"{place} was trained with other options than {', '.join(changes)}: leave them out")
+
+
+def check_known(name: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Raise TypeError for unknown keyword arguments, which LeRobot's policies ignore."""
+    if unknown := sorted(given.keys() - set(known)):
+        raise TypeError(f"{name} takes no {', '.join(unknown)}: it takes {', '.join(known)}")

@@ -1,0 +1,172 @@
+"""Saved policies of the plugin that do not fit, and names in files that import nothing."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from tests.lerobot.test_plugin import VLA, flow_policy, small, warm
+
+pytest.importorskip("lerobot")
+pytest.importorskip("lerobot_policy_warmprior")
+pytest.importorskip("transformers")
+
+NAMES = [*VLA, "warm_flow"]
+
+
+def made(found, name, **options):
+    return flow_policy(found, **options) if name == "warm_flow" else warm(found, name, **options)
+
+
+def load(found, name, folder, **options):
+    if name == "warm_flow":
+        return found[name].from_pretrained(folder, **options)
+    with small(name):
+        return found[name].from_pretrained(folder, **options)
+
+
+def edit(folder, change):
+    """Change the weights in a folder."""
+    weights = load_file(folder / "model.safetensors")
+    change(weights)
+    save_file(weights, folder / "model.safetensors")
+
+
+def misfit(folder, how):
+    """Spoil the weights; return what the error has to name."""
+    names = sorted(load_file(folder / "model.safetensors"))
+    one = names[-1]
+    if how == "absent":
+        (folder / "model.safetensors").unlink()
+        return "model.safetensors"
+    if how == "foreign":
+        save_file({"other.weight": torch.zeros(3)}, folder / "model.safetensors")
+        return "other.weight"
+    if how == "missing":
+        edit(folder, lambda weights: weights.pop(one))
+    elif how == "shape":
+        edit(folder, lambda weights: weights.update({one: torch.zeros(99)}))
+    else:
+        edit(folder, lambda weights: weights.update({"more.weight": torch.zeros(3)}))
+        return "more.weight"
+    return one
+
+
+@pytest.mark.parametrize("how", ["absent", "foreign", "missing", "shape", "unexpected"])
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_that_do_not_fit_are_refused_by_name(found, name, how, tmp_path):
+    made(found, name).save_pretrained(tmp_path)
+    load(found, name, tmp_path)
+    said = misfit(tmp_path, how)
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        load(found, name, tmp_path)
+    assert said in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_buffers_of_normalisation_of_old_checkpoints(found, tmp_path):
+    """LeRobot's processors have them now."""
+    made(found, "warm_smolvla").save_pretrained(tmp_path)
+    old = {"normalize_inputs.buffer_observation_state.mean": torch.zeros(6)}
+    edit(tmp_path, lambda weights: weights.update(old))
+    load(found, "warm_smolvla", tmp_path)
+
+
+CHANGES = {
+    "warm_flow": [
+        {"precondition": False},
+        {"num_layers": 2},
+        {"num_heads": 3},
+        {"n_obs_steps": 1},
+        {"prior": "past,sigma=0.1"},
+        {"prior": "gaussian"},
+        {"prior_chunk": 8},
+        {"embedding_dim": 48},
+    ],
+    "warm_pi05": [
+        {"prior": "preview"},
+        {"prior_chunk": 4},
+        {"sigma_unit": "std"},
+        {"prior": "past,sigma=0.1"},
+    ],
+    "warm_smolvla": [{"prior": "preview"}, {"prior_chunk": 4}],
+    "warm_groot": [{"prior": "preview"}, {"prior_chunk": 4}],
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_options_that_contradict_the_saved_ones(found, name, tmp_path):
+    policy = made(found, name, n_action_steps=4)
+    policy.save_pretrained(tmp_path)
+    kind = type(policy.config)
+    for change in CHANGES[name]:
+        (option,) = change
+        config = kind.from_pretrained(tmp_path)
+        setattr(config, option, change[option])
+        said = "prior" if option == "prior_chunk" else option
+        with pytest.raises(ValueError, match=rf"trained with other options than .*\b{said}="):
+            load(found, name, tmp_path, config=config)
+    # What changes no meaning is free.
+    config = kind.from_pretrained(tmp_path)
+    config.n_action_steps = 2
+    loaded = load(found, name, tmp_path, config=config)
+    assert loaded.config.n_action_steps == 2
+    with pytest.raises(TypeError, match="n_action_step"):
+        load(found, name, tmp_path, n_action_step=3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("prior", ["evil_module:Prior", "evil_module", "evil_module:Prior,sigma=0.1"])
+def test_a_prior_in_a_file_imports_nothing(found, name, prior, tmp_path, monkeypatch):
+    made(found, name).save_pretrained(tmp_path)
+    content = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(content | {"prior": prior}))
+    (tmp_path / "evil_module.py").write_text("raise SystemExit('ran')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"unknown prior 'evil_module.*--policy\.discover_packages_path"):
+        load(found, name, tmp_path)
+    with pytest.raises(ValueError, match="unknown prior 'evil_module"):
+        found[name].config_class(prior=prior, device="cpu").action_delta_indices  # noqa: B018
+    assert "evil_module" not in sys.modules
+
+
+@pytest.mark.parametrize("place", ["path", "type"])
+def test_own_priors_come_by_lerobots_own_option(found, place, tmp_path, monkeypatch):
+    from lerobot.configs import parser
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    name = f"own_priors_by_{place}"
+    package = tmp_path / name
+    package.mkdir()
+    (package / "__init__.py").write_text(
+        f"from warmprior import PastPrior\n\n\nclass Own(PastPrior):\n    name = '{name}'\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    made(found, "warm_flow").save_pretrained(tmp_path / "policy")
+    config, *arguments = {
+        "path": [
+            EvalPipelineConfig,
+            f"--env.discover_packages_path={name}",
+            f"--policy.path={tmp_path / 'policy'}",
+            "--env.type=warmprior_robosuite",
+        ],
+        "type": [
+            TrainPipelineConfig,
+            f"--policy.discover_packages_path={name}",
+            "--policy.type=warm_flow",
+            "--dataset.repo_id=local/none",
+        ],
+    }[place]
+    monkeypatch.setattr(sys, "argv", ["lerobot", *arguments, f"--policy.prior={name},sigma=0.1"])
+    seen = []
+
+    def main(cfg):
+        seen.append(cfg.policy.make_prior())
+
+    main.__annotations__["cfg"] = config
+    parser.wrap()(main)()
+    assert seen[0].name == name and seen[0].sigma == 0.1
