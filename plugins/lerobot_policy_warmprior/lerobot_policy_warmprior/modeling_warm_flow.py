@@ -47,8 +47,8 @@ def training_episodes(meta: Any) -> list[int] | None:
 
     LeRobot gives a policy the metadata, which is of all episodes: only its dataset, which holds them, knows.
     """
-    holders = (o for o in gc.get_objects() if isinstance(o, LeRobotDataset) and o.meta is meta)
-    dataset = next(holders, None)
+    datasets = (o for o in gc.get_objects() if issubclass(type(o), LeRobotDataset))
+    dataset = next((o for o in datasets if o.meta is meta), None)
     return None if dataset is None else dataset.episodes
 
 
