@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from warmprior.io.script import ERRORS, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
@@ -160,7 +161,7 @@ class Train:
     training: TrainingConfig
     prior: str = "past"
     chunk: int = 8
-    nfe: int = 9
+    nfe: int = DEFAULT_NFE
     observation_keys: tuple[str, ...] | None = None
     image_keys: tuple[str, ...] = ()
     fast_rendering: bool = False

@@ -370,7 +370,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         if poses and conventions is None:
             raise DatasetError(
                 f"{index.path}: actions are absolute poses, but env_args declare deltas: take "
-                "absolute_actions=True (--actions absolute), or correct control_delta (input_type) there"
+                "absolute_actions=True (of a Task: actions='absolute'), or correct control_delta (input_type)"
             )
 
         def read_actions(demo: str, out: np.ndarray) -> None:

@@ -113,7 +113,7 @@ def train_policy(
     Keyword Args:
         observation_keys: of a place, see :meth:`Task.open`.
         image_keys: likewise.
-        nfe: network evaluations per chunk, saved with the policy; 9 by default.
+        nfe: network evaluations per chunk, saved with the policy; 3 by default.
         network: the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
         start: where samplers start; at the source by default.

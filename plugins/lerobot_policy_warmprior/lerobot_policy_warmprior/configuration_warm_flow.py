@@ -16,6 +16,7 @@ from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
 from warmprior import Prior
 from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
+from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
 from warmprior.training import warmup_cosine
@@ -66,7 +67,7 @@ class WarmFlowConfig(PreTrainedConfig):
     prior_chunk: int | None = None
     prior: str = "past"
     cold_probability: float = 0.0
-    nfe: int = 9
+    nfe: int = DEFAULT_NFE
     precondition: bool = True
     ema_rate: float = 0.995
     network: str = ""
