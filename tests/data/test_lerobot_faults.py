@@ -192,11 +192,15 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
 def test_masks_and_episodes_are_some_of_those_that_there_are(root):
     described(observations=STATE, masks={"none": [], "more": [0, 3], "floats": [0.5], "ok": [2, 0]})(root)
     seen = {"observation_keys": ["observation.state"]}
-    for name in ("none", "more", "floats"):
+    for options in ({"filter_key": "none"}, {"episodes": []}, {"filter_key": "ok", "episodes": [1]}):
+        with pytest.raises(DatasetError, match="no demonstrations"):
+            LeRobotDemonstrations(root, **options, **seen)
+    assert LeRobotDemonstrations(root, filter_key="ok", episodes=[2], **seen).num_episodes == 1
+    for name in ("more", "floats"):
         with pytest.raises(DatasetError, match=rf"the mask '{name}' must be some of the episodes 0 to 2"):
             LeRobotDemonstrations(root, filter_key=name, **seen)
     assert LeRobotDemonstrations(root, filter_key="ok", **seen).num_episodes == 2
-    for numbers in ([], [3], [-1], [True], ["0"]):
+    for numbers in ([3], [-1], [True], ["0"]):
         with pytest.raises(DatasetError, match="episodes must be some of the episodes 0 to 2"):
             LeRobotDemonstrations(root, episodes=numbers, **seen)
 

@@ -126,7 +126,7 @@ def _metadata(root: Path) -> Any:
     if version != LEROBOT_VERSION:
         raise DatasetError(
             f"{root} is a LeRobotDataset {version}, and {LEROBOT_VERSION} is needed: convert one of v2.1 by "
-            "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=USER/NAME"
+            "python -m lerobot.scripts.convert_dataset_v21_to_v30"
         )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
         if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
@@ -200,7 +200,7 @@ def _check_columns(metadata: Any, names: Sequence[str]) -> None:
 
 def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
     """Check numbers of episodes, and return them in order, each once."""
-    if not numbers or any(type(number) is not int or not 0 <= number < count for number in numbers):
+    if any(type(number) is not int or not 0 <= number < count for number in numbers):
         raise DatasetError(
             f"{root}: {what} must be some of the episodes 0 to {count - 1}, got {list(numbers)}"
         )
@@ -287,13 +287,14 @@ def read_lerobot_index(
         if name not in metadata.depth_keys
     }
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    count = len(rows)
     if episodes is not None:
-        rows = [rows[number] for number in _chosen(root, "episodes", episodes, len(rows))]
+        rows = [rows[number] for number in _chosen(root, "episodes", episodes, count)]
     if filter_key is not None:
         masks = described.get("masks", {})
         if filter_key not in masks:
             raise unknown(root, "filter key", filter_key, masks)
-        chosen = _chosen(root, f"the mask {filter_key!r}", masks[filter_key], len(rows))
+        chosen = _chosen(root, f"the mask {filter_key!r}", masks[filter_key], count)
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demos, len(rows))
     rows = rows[:demos]
