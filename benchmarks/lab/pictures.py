@@ -31,7 +31,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         played = [p for p in policies if p.name in set(mine.policy)]
         chunks = ", ".join(map(str, sorted(set(mine.chunk))))
         title = f"{title_of(played[0].task())}, H = {chunks}"
-        plot_success(per_seed(mine, 1), out / f"success{end}.png", title=title)
+        plot_success(per_seed(mine, options.evaluation.top_k), out / f"success{end}.png", title=title)
         label = dict(zip(mine.policy, mine.method, strict=True))
         losses: dict[str, list[list[tuple[int, float]]]] = {}
         for policy in played:

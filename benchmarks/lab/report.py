@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from pandas import DataFrame, Series
 
@@ -22,7 +23,7 @@ from lab.methods import label
 from lab.options import IMAGES, Options, with_parts
 from lab.paper import paper_success
 from lab.rows import read_rows
-from lab.statistics import paired_probability_better, probability_better, top_k_mean
+from lab.statistics import paired_probability_better, probability_better
 from warmprior.diagnostics import success_posterior
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
@@ -74,14 +75,30 @@ def labelled(rows: DataFrame, *apart: str) -> DataFrame:
 
 
 def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
-    """A row per training and way to play it: its last checkpoint's, with the `success` of its best ones."""
-    keys = [name for name in ("policy", "nfe", "delay", "guidance") if name in rows]
-    rows = rows.reset_index(drop=True)
-    groups = rows.groupby(keys, sort=False, dropna=False)
-    found = rows.loc[groups["checkpoint"].idxmax()]
-    best = groups["success_rate"].agg(lambda rates: top_k_mean(list(rates), top_k))
-    counts = groups["checkpoint"].nunique()
-    return found.assign(success=best.to_numpy(), checkpoints=counts.to_numpy()).reset_index(drop=True)
+    """A row per training and way to play it, of its best `top_k` checkpoints.
+
+    Everything that depends on the checkpoint is of the same ones. They played the same episodes, so that an
+    episode counts once, by the mean of its outcomes: `solved`, from which all that a report says of success
+    follows.
+    """
+    keys = [name for name in ("policy", "nfe", "delay", "guidance", "temperature") if name in rows]
+    groups = rows.reset_index(drop=True).groupby(keys, sort=False, dropna=False)
+    return DataFrame([_of_best(group, top_k) for _, group in groups]).infer_objects().reset_index(drop=True)
+
+
+def _of_best(group: DataFrame, top_k: int) -> Series:
+    last, best = group.loc[group["checkpoint"].idxmax()].copy(), group
+    if len(group) > 1:
+        best = group.nlargest(top_k, "success_rate")
+        measured = best.select_dtypes("number").drop(columns=["checkpoint", "seed", "nfe"], errors="ignore")
+        last.update(measured.mean())
+    if "outcomes" in group and best["outcomes"].notna().all():
+        solved = np.mean([np.array([*map(int, outcomes)]) for outcomes in best["outcomes"]], 0)
+        last["solved"] = solved
+    last["success"] = last["success_rate"] = best["success_rate"].mean()
+    last["successes"] = best["successes"].mean()
+    last["checkpoints"] = group["checkpoint"].nunique()
+    return last
 
 
 def pooled(rows: DataFrame) -> DataFrame:
@@ -102,7 +119,7 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     found = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
     found = found.assign(seeds=groups.size()).join(groups[measures].mean()).join(spread).reset_index()
     counts = found[["successes", "episodes"]].to_numpy()
-    intervals = [success_posterior(*map(int, pair)).interval(0.95) for pair in counts]
+    intervals = [success_posterior(*pair).interval(0.95) for pair in counts]
     found["low"], found["high"] = zip(*intervals, strict=True)
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
     found["paper"] = [paper_success(row) for row in firsts]
@@ -120,19 +137,19 @@ def _beside(found: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFram
     found["one_sigma"] = found["gain"] > deviations[0] + deviations[1]
     pairs = found[["successes", "episodes"]].join(theirs[["successes", "episodes"]], rsuffix="_first")
     found["better"] = [
-        probability_better(*map(int, counts)) if not math.isnan(gain) else math.nan
+        probability_better(*counts) if not math.isnan(gain) else math.nan
         for counts, gain in zip(pairs.to_numpy(), found["gain"], strict=True)
     ]
     # Episodes of equal seeds, of trainings with equal seeds.
     both = seeds[seeds["method"] != first].merge(
         seeds[seeds["method"] == first], on=[*place, "seed"], suffixes=("", "_first")
     )
-    outcomes = [list(zip(*pair, strict=True)) for pair in both[["outcomes", "outcomes_first"]].to_numpy()]
-    both["won"] = [pairs.count(("1", "0")) for pairs in outcomes]
-    both["lost"] = [pairs.count(("0", "1")) for pairs in outcomes]
+    apart = [mine - first for mine, first in both[["solved", "solved_first"]].to_numpy()]
+    both["won"] = [pairs.clip(min=0).sum() for pairs in apart]
+    both["lost"] = [-pairs.clip(max=0).sum() for pairs in apart]
     found = found.join(both.groupby(list(keys))[["won", "lost"]].sum(), on=list(keys))
     found["paired"] = [
-        math.nan if math.isnan(won) else paired_probability_better(int(won), int(lost))
+        math.nan if math.isnan(won) else paired_probability_better(won, lost)
         for won, lost in found[["won", "lost"]].to_numpy()
     ]
     # A flow is the same at any NFE, and the baseline may lack this one.
@@ -238,7 +255,7 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
             name = others["success"].idxmax()
             counts = totals.loc[[name, first], ["successes", "episodes"]].to_numpy().flatten()
             gain = totals.loc[name, "success"] - totals.loc[first, "success"]
-            chance = probability_better(*map(int, counts))
+            chance = probability_better(*counts)
             chances.append(f"{name} {gain:+.1%}, {chance:.2f} at NFE {nfe}")
     where = f"{len(problems)} problems ({', '.join(problems)})" if len(problems) > 1 else problems[0]
     lines = [

@@ -1,49 +1,42 @@
-"""Statistics of a report: which rate is larger, checkpoint averages, and intervals of ratios."""
+"""Statistics of a report: which rate is larger, and intervals of ratios."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from statistics import fmean
 
 import numpy as np
 import torch
-from scipy.stats import betanbinom, bootstrap
+from scipy.stats import bootstrap
 from torch import Tensor
 
-from warmprior.checks import check_whole_numbers
 from warmprior.diagnostics import success_posterior
 
 RESAMPLES = 2_000
 """Of a bootstrap."""
 
 
-def probability_better(successes_a: int, episodes_a: int, successes_b: int, episodes_b: int) -> float:
+GRID = np.linspace(0.0, 1.0, 20_001)
+"""Of rates, for the integral of :func:`probability_better`."""
+
+
+def probability_better(successes_a: float, episodes_a: int, successes_b: float, episodes_b: int) -> float:
     r"""Return the probability that ``a`` succeeds more often than ``b``, both under a uniform prior.
 
     With :math:`p_a \sim \mathrm{Beta}(\alpha_a, \beta_a)` and likewise :math:`p_b`, as in
-    :func:`~warmprior.diagnostics.success_posterior`,
-
-    .. math::
-        P(p_a > p_b) = \sum_{i=0}^{\alpha_a - 1} \frac{B(\alpha_b + i, \beta_a + \beta_b)}
-            {(\beta_a + i)\, B(1 + i, \beta_a)\, B(\alpha_b, \beta_b)},
-
-    the distribution function of a beta negative binomial. Pooled episodes of several training seeds are not
-    quite independent; the probability is then too extreme.
+    :func:`~warmprior.diagnostics.success_posterior`, it is :math:`\int f_a(x) F_b(x) \, dx`. Successes may be
+    means over several checkpoints that played the same episodes. Pooled episodes of several training seeds
+    are not quite independent; the probability is then too extreme.
 
     Examples:
         >>> from lab.statistics import probability_better
         >>> round(probability_better(18, 20, 12, 20), 3), round(probability_better(0, 0, 0, 0), 3)
         (0.984, 0.5)
     """
-    (alpha_a, beta_a), (alpha_b, beta_b) = (
-        success_posterior(*counts).args for counts in ((successes_a, episodes_a), (successes_b, episodes_b))
-    )
-    better = betanbinom(beta_a, beta_b, alpha_b)
-    return min(1.0, float(better.cdf(alpha_a - 1)))
+    a, b = success_posterior(successes_a, episodes_a), success_posterior(successes_b, episodes_b)
+    return float(np.clip(np.trapezoid(b.cdf(GRID) * a.pdf(GRID), GRID), 0.0, 1.0))
 
 
-def paired_probability_better(wins: int, losses: int) -> float:
+def paired_probability_better(wins: float, losses: float) -> float:
     r"""Return the posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
 
     Under a uniform prior the share of ``wins`` (episodes that ``a`` alone solves, :math:`w`) among these and
@@ -56,32 +49,14 @@ def paired_probability_better(wins: int, losses: int) -> float:
     the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes of the
     same seeds differ in difficulty.
 
-    Raises:
-        ValueError: if a count is negative.
+    Of several checkpoints that played the same episodes, an episode counts once, by the mean of its outcomes.
 
     Examples:
         >>> from lab.statistics import paired_probability_better
         >>> round(paired_probability_better(3, 0), 4), round(paired_probability_better(4, 4), 4)  # 15 / 16
         (0.9375, 0.5)
     """
-    check_whole_numbers(0, wins=wins, losses=losses)
     return float(success_posterior(wins, wins + losses).sf(0.5))
-
-
-def top_k_mean(rates: Sequence[float], k: int) -> float:
-    """Mean of the ``k`` largest rates (all of them, if there are fewer).
-
-    The paper averages checkpoints like this. Choosing and reporting on the same episodes flatters every
-    method alike.
-
-    Examples:
-        >>> from lab.statistics import top_k_mean
-        >>> top_k_mean([0.1, 0.9, 0.5, 0.7], 3)
-        0.7...
-    """
-    if not rates or k < 1:
-        raise ValueError(f"need at least one rate and k >= 1, got {len(rates)} rates and k={k}")
-    return fmean(sorted(rates, reverse=True)[:k])
 
 
 def bootstrap_ratio(

@@ -78,7 +78,9 @@ def test_methods_and_problems_have_names_that_differ():
     assert list(found["problem"]) == problems
 
 
-def test_a_summary_is_what_scipy_and_counting_say():
+@pytest.mark.parametrize("top_k", [1, 2, 3])
+def test_a_summary_is_what_scipy_and_counting_say(top_k):
+    """All of a row is of the same checkpoints, and their episodes count once each."""
     generator = np.random.default_rng(0)
     episodes = {
         key: "".join(generator.choice(["0", "1"], 6, p=[1 - p, p]))
@@ -89,35 +91,49 @@ def test_a_summary_is_what_scipy_and_counting_say():
     }
     names = ("prior", "data", "seed", "checkpoint", "nfe")
     rows = [row(text, **dict(zip(names, key, strict=True))) for key, text in episodes.items()]
-    found = report.summary(pd.DataFrame(rows), 2).set_index(["data", "prior", "nfe"])
+    found = report.summary(pd.DataFrame(rows), top_k).set_index(["data", "prior", "nfe"])
     assert len(found) == 8
     for (data, prior, nfe), record in found.iterrows():
 
-        def rates(prior, data=data, nfe=nfe):
-            solved = [[episodes[prior, data, s, c, nfe].count("1") for c in (30, 60, 100)] for s in range(3)]
-            return [sum(sorted(seed)[1:]) / 12 for seed in solved]
+        def solved(prior, data=data, nfe=nfe):
+            """Of every seed the mean outcome of each episode, over the best checkpoints; ``[3, 6]``."""
+            seeds = []
+            for seed in range(3):
+                texts = [episodes[prior, data, seed, c, nfe] for c in (30, 60, 100)]
+                best = sorted(texts, key=lambda text: -text.count("1"))[:top_k]
+                seeds.append(np.mean([[int(x) for x in text] for text in best], 0))
+            return np.array(seeds)
 
-        last = [episodes[prior, data, s, 100, nfe] for s in range(3)]
-        base = [episodes["gaussian", data, s, 100, nfe] for s in range(3)]
-        k, b = (sum(text.count("1") for text in texts) for texts in (last, base))
-        assert record["success"] == pytest.approx(np.mean(rates(prior)))
-        assert record["success_std"] == pytest.approx(np.std(rates(prior), ddof=1))
-        assert (record["seeds"], record["episodes"], record["successes"]) == (3, 18, k)
-        ends = stats.beta(k + 1, 19 - k).ppf([0.025, 0.975])
-        assert (record["low"], record["high"]) == pytest.approx(tuple(ends))
+        mine, first = solved(prior), solved("gaussian")
+        k, b = mine.sum(), first.sum()
+        assert record["success"] == pytest.approx(mine.mean()) == record["successes"] / record["episodes"]
+        assert record["success_std"] == pytest.approx(np.std(mine.mean(1), ddof=1))
+        assert (record["seeds"], record["episodes"]) == (3, 18)
+        posterior = stats.beta(k + 1, 19 - k)
+        assert (record["low"], record["high"]) == pytest.approx(tuple(posterior.ppf([0.025, 0.975])))
         if prior == "gaussian":
             assert record[["gain", "better", "won", "lost", "paired"]].isna().all()
             continue
-        gain = np.mean(rates("past")) - np.mean(rates("gaussian"))
-        spread = sum(np.std(rates(p), ddof=1) for p in ("past", "gaussian"))
-        assert record["gain"] == pytest.approx(gain) and record["one_sigma"] == (gain > spread)
-        mine, theirs = stats.beta(k + 1, 19 - k), stats.beta(b + 1, 19 - b)
-        better = integrate.quad(lambda p, a=mine, b=theirs: a.pdf(p) * b.cdf(p), 0, 1)[0]
-        assert record["better"] == pytest.approx(better)
-        pairs = list(zip("".join(last), "".join(base), strict=True))
-        won, lost = (sum(pair == (a, b) for pair in pairs) for a, b in (("1", "0"), ("0", "1")))
-        assert (record["won"], record["lost"]) == (won, lost)
+        spread = sum(np.std(part.mean(1), ddof=1) for part in (mine, first))
+        assert record["gain"] == pytest.approx(mine.mean() - first.mean())
+        assert record["one_sigma"] == (record["gain"] > spread)
+        other = stats.beta(b + 1, 19 - b)
+        better = integrate.quad(lambda p, a=posterior, b=other: a.pdf(p) * b.cdf(p), 0, 1)[0]
+        assert record["better"] == pytest.approx(better, abs=1e-6)
+        won, lost = (np.clip(sign * (mine - first), 0, 1).sum() for sign in (1, -1))
+        assert (record["won"], record["lost"]) == pytest.approx((won, lost))
+        assert record["gain"] * record["episodes"] == pytest.approx(won - lost)
         assert record["paired"] == pytest.approx(stats.beta(won + 1, lost + 1).sf(0.5))
+
+
+def test_a_gain_and_its_probabilities_are_of_the_same_checkpoints():
+    """The last checkpoint of WP-Past is its worst, and its best ones lead."""
+    rows = [row(k, checkpoint=c) for c, k in ((1, 4), (2, 4), (3, 4))]
+    rows += [row(k, prior="past", checkpoint=c) for c, k in ((1, 9), (2, 9), (3, 1))]
+    _, best = report.summary(pd.DataFrame(rows), 2).to_dict("records")
+    _, every = report.summary(pd.DataFrame(rows), 3).to_dict("records")
+    assert best["gain"] == pytest.approx(0.5) and min(best["better"], best["paired"]) > 0.95
+    assert every["gain"] == pytest.approx(19 / 30 - 0.4) and every["better"] < best["better"]
 
 
 def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
@@ -199,12 +215,12 @@ def test_a_table_has_the_mean_and_deviation_of_every_group_in_the_order_of_the_r
     assert list(one.values()) == ["Base", "1", "50.0%", "0.500", "0.100"]
 
 
-def test_a_training_counts_by_its_last_checkpoint_and_succeeds_by_its_best_ones():
+def test_a_training_is_shown_by_its_best_checkpoints():
     rates = {50: 9, 100: 3, 150: 6}
     rows = [row(k, checkpoint=n, iterations=150, boundary_jump=n / 100) for n, k in rates.items()]
     (found,) = report.per_seed(pd.DataFrame(rows), 2).to_dict("records")
-    assert (found["checkpoint"], found["boundary_jump"], found["success_rate"]) == (150, 1.5, 0.6)
-    assert found["success"] == pytest.approx((9 + 6) / 20)
+    assert found["checkpoints"] == 3 and found["boundary_jump"] == pytest.approx((0.5 + 1.5) / 2)
+    assert found["success"] == found["success_rate"] == pytest.approx((9 + 6) / 20)
 
 
 def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):

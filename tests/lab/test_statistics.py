@@ -11,19 +11,9 @@ from lab.statistics import (
     bootstrap_ratio,
     paired_probability_better,
     probability_better,
-    top_k_mean,
 )
 
 rates = st.lists(st.floats(0, 1), min_size=1, max_size=8)
-
-
-@given(rates, st.integers(1, 10))
-def test_top_k_mean_is_the_largest_mean_of_any_k(values, k):
-    from itertools import combinations
-
-    k_used = min(k, len(values))
-    brute = max(sum(c) / k_used for c in combinations(values, k_used))
-    assert top_k_mean(values, k) == pytest.approx(brute)
 
 
 def test_bootstrap_agrees_with_the_delta_method():

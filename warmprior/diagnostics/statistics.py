@@ -8,11 +8,11 @@ from warmprior.checks import check_between
 from warmprior.io.extras import require
 
 
-def success_posterior(successes: int, episodes: int) -> Any:
+def success_posterior(successes: float, episodes: float) -> Any:
     """Posterior of a success rate under a uniform prior, Beta(k + 1, n - k + 1) (appendix A).
 
     Args:
-        successes: ``k``.
+        successes: ``k``, or its mean over several checkpoints that played the same episodes.
         episodes: ``n``.
 
     Returns:
