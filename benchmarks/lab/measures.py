@@ -33,6 +33,7 @@ from warmprior.diagnostics import (
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history
 from warmprior.keys import EPISODE, OBSERVATION, STATE
+from warmprior.modules.network import device_of
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
@@ -183,10 +184,10 @@ def straightness(
     measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}
     jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
     for method, actor in tqdm(jobs, desc="curvature", disable=None):
-        device = next(actor.parameters()).device
+        windows = observations.windows(actor.prior, see_history=actor.sees_history)
+        device = device_of(actor, windows)
         # Of the earlier prediction: at deployment its noise and that of the next are independent.
         earlier = torch.Generator(device).manual_seed(seed + 1)
-        windows = observations.windows(actor.prior, see_history=actor.sees_history)
         batches = {"training": encoded_windows(actor, windows)}
         if depends_on_history(actor, batches["training"]):
             batches["deployed"] = observations.deployed(actor, generator=earlier)
