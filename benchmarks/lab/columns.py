@@ -21,6 +21,7 @@ _COMPARED: dict[str, tuple[str, str]] = {
     "policy": ("", "folder of the policy in policies/, or its method"),
     "checkpoint": ("d", "iteration of the training at which the policy was saved"),
     "nfe": ("d", "network evaluations per chunk"),
+    "temperature": ("g", "factor of the source's noise at decisions"),
     "execute": ("d", "actions executed per decision"),
     "delay": ("d", "control steps until a chunk takes effect"),
     "guidance": ("", "rtc: guided by Real-Time Chunking"),

@@ -44,7 +44,7 @@ def compare(
 
     def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
         delays = row.get("delay") or 0, row.get("guidance") or ""
-        return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
+        return places[row["policy"]], row["checkpoint"], -row["nfe"], -row["temperature"], *delays
 
     def add(row: dict[str, Any]) -> None:
         rows.append(row)
@@ -60,10 +60,11 @@ def compare(
         )
     cells = {
         policy.name: [
-            replace(condition, checkpoint=checkpoint, nfe=nfe)
-            for checkpoint, nfe, condition in product(
+            replace(condition, checkpoint=checkpoint, nfe=nfe, temperature=temperature)
+            for checkpoint, nfe, temperature, condition in product(
                 policy.training.checkpoint_iterations,
                 policy.method.nfes(evaluation.nfe),
+                evaluation.temperature,
                 conditions(policy.method),
             )
         ]

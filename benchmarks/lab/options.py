@@ -39,7 +39,7 @@ from warmprior.io.distributed import check_batch, from_leader, launched, rank
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 from warmprior.io.script import run_script
 from warmprior.modules import imagenet_weights
-from warmprior.modules.ode import check_grid
+from warmprior.modules.ode import Sampling, check_grid
 from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.options import PAPER, PRETRAINED
 
@@ -86,13 +86,16 @@ class Evaluation:
     seeds: int = 1  # number of training seeds, from --seed on
     episodes: int = 25  # evaluation episodes per cell
     nfe: tuple[int, ...] = (9, 3, 1)  # network evaluations per chunk
+    temperature: tuple[float, ...] = (1.0,)  # factors of the source's noise at decisions: a row each
     top_k: int = 1  # best checkpoints averaged per seed
     play_on: bool = False  # go on after success, up to the time limit; success at any step counts
     grid: str = "uniform"  # uniform, or dense-jump (one last step from half way; dense-jump:0.7 from there)
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
-        check_given(self, "nfe")
+        check_given(self, "nfe", "temperature")
+        for temperature in self.temperature:
+            Sampling(temperature=temperature)
         check_grid(self.grid)
 
     @property

@@ -31,12 +31,17 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         played = [p for p in policies if p.name in set(mine.policy)]
         chunks = ", ".join(map(str, sorted(set(mine.chunk))))
         title = f"{title_of(played[0].task())}, H = {chunks}"
-        plot_success(per_seed(mine, options.evaluation.top_k), out / f"success{end}.png", title=title)
+        seeds = per_seed(mine, options.evaluation.top_k)
+        if mine["temperature"].nunique() > 1:
+            seeds["nfe"] = [
+                f"NFE {n}, noise x {t:g}" for n, t in zip(seeds["nfe"], seeds["temperature"], strict=True)
+            ]
+        plot_success(seeds, out / f"success{end}.png", title=title)
         label = dict(zip(mine.policy, mine.method, strict=True))
         losses: dict[str, list[list[tuple[int, float]]]] = {}
         for policy in played:
             losses.setdefault(label[policy.name], []).append(policy.losses)
-        fewest = mine[mine.nfe == min(mine.nfe)]
+        fewest = mine[(mine.nfe == min(mine.nfe)) & (mine.temperature == max(mine.temperature))]
         plot_learning_curves(losses, fewest, out / f"learning_curves{end}.png", title=title)
         task = played[0].task()
         if not options.run.films:

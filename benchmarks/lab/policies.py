@@ -339,12 +339,14 @@ class Cell:
 
     checkpoint: int  # of the policy's training, an iteration
     nfe: int  # network evaluations per chunk
+    temperature: float = 1.0  # factor of the source's noise
     delay: int | None = None  # control steps until chunks take effect; None: the simulator waits
     execute: int | None = None  # actions per decision; all H by default
     guidance: RealTimeChunking | None = None
 
     def facts(self) -> dict[str, Any]:
         found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
+        found["temperature"] = self.temperature
         if self.delay is not None:
             guidance = "none" if self.guidance is None else "rtc"
             found |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}
@@ -367,7 +369,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
 def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
     """A policy and its environment: an episode after one of the same policy needs no preparation."""
     key = (policy.data, *policy.place, policy.network.observation_steps)
-    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
+    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance, temperature=cell.temperature)
     base = simulator(key, play_on)
     return actor, policy.task().env(actor, base, execute=cell.execute, delay=cell.delay)
 

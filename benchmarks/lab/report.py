@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from pandas import DataFrame, Series
 
-from lab.columns import COLUMNS, column
+from lab.columns import COLUMNS, IDENTITY, column
 from lab.files import PartialFailure
 from lab.methods import label
 from lab.options import IMAGES, Options, with_parts
@@ -89,8 +89,8 @@ def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
 def _of_best(group: DataFrame, top_k: int) -> Series:
     last, best = group.loc[group["checkpoint"].idxmax()].copy(), group
     if len(group) > 1:
-        best = group.nlargest(top_k, "success_rate")
-        measured = best.select_dtypes("number").drop(columns=["checkpoint", "seed", "nfe"], errors="ignore")
+        best = group.sort_values(["success_rate", "checkpoint"], ascending=False).head(top_k)
+        measured = best.select_dtypes("number").drop(columns=[*IDENTITY], errors="ignore")
         last.update(measured.mean())
     if "outcomes" in group and best["outcomes"].notna().all():
         solved = np.mean([np.array([*map(int, outcomes)]) for outcomes in best["outcomes"]], 0)
@@ -111,9 +111,19 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     """All that is known per problem, method (delay) and NFE, beside the first method's."""
     seeds = per_seed(labelled(rows), top_k)
     seeds = seeds.assign(**seeds.reindex(columns=[*RELATIVE, *BOUNDS, "memory_gain"]).astype(float))
-    keys = [name for name in ("problem", "method", "delay", "nfe") if name in seeds]
+    keys = [name for name in ("problem", "method", "delay", "nfe", "temperature") if name in seeds]
     groups = seeds.groupby(keys, sort=False)
-    counted = {*keys, *FACTS, "seed", "iterations", "checkpoint", "episodes", "successes", "success_rate"}
+    counted = {
+        *keys,
+        *FACTS,
+        "solved",
+        "seed",
+        "iterations",
+        "checkpoint",
+        "episodes",
+        "successes",
+        "success_rate",
+    }
     measures = [name for name in seeds.select_dtypes("number") if name not in {*counted, "checkpoints"}]
     spread = groups[measures].std().dropna(axis=1, how="all").add_suffix("_std")
     found = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
@@ -213,7 +223,9 @@ def _placed(found: DataFrame) -> DataFrame:
     """A summary with the `place` where methods compare, and the `text` of a success with its gain."""
     delay = ", delay " + found["delay"].astype(str) if "delay" in found else ""
     found = found.assign(place=found["problem"] + delay, column="NFE " + found["nfe"].astype(str))
-    best = found.groupby(["place", "nfe"])["success"].transform("max")
+    if found.get("temperature", Series([1.0])).nunique() > 1:
+        found["column"] += ", noise x " + found["temperature"].map("{:g}".format)
+    best = found.groupby(["place", "column"])["success"].transform("max")
     texts = []
     for row, most in zip(found.to_dict("records"), best, strict=True):
         # Where nothing is solved, nobody is the best.
@@ -245,18 +257,18 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
     first, problems = found["method"].iloc[0], found["problem"].unique()
     best, chances = [], []
     sums = {"success": "mean", "successes": "sum", "episodes": "sum", "task": "size"}
-    for nfe, group in found.sort_values("nfe", ascending=False).groupby("nfe", sort=False):
+    for nfe, group in _placed(found).sort_values("nfe", ascending=False).groupby("column", sort=False):
         totals = group.sort_index().groupby("method", sort=False).agg(sums)
         totals = totals[totals["task"] == totals["task"].max()]  # what was played everywhere
         name = totals["success"].idxmax()
-        best.append(f"{name} {totals.loc[name, 'success']:.1%} at NFE {nfe}")
+        best.append(f"{name} {totals.loc[name, 'success']:.1%} at {nfe}")
         others = totals.drop(first, errors="ignore")
         if first in totals.index and len(others):
             name = others["success"].idxmax()
             counts = totals.loc[[name, first], ["successes", "episodes"]].to_numpy().flatten()
             gain = totals.loc[name, "success"] - totals.loc[first, "success"]
             chance = probability_better(*counts)
-            chances.append(f"{name} {gain:+.1%}, {chance:.2f} at NFE {nfe}")
+            chances.append(f"{name} {gain:+.1%}, {chance:.2f} at {nfe}")
     where = f"{len(problems)} problems ({', '.join(problems)})" if len(problems) > 1 else problems[0]
     lines = [
         f"{_count(found['method'].nunique(), 'method')} on {where}: {_experiment(found, top_k)}.",
@@ -302,7 +314,7 @@ def success_report(found: DataFrame, top_k: int, notes: Sequence[str] = (), sour
             "The paper used the official human demonstrations, and we used others. Compare gains within a "
             "row, not numbers across rows."
         )
-    keys = [name for name in ("problem", "delay", "nfe", "method") if name in found]
+    keys = [name for name in ("problem", "delay", "nfe", "temperature", "method") if name in found]
     return f"{markdown(frame, listed)}\n{table(found, keys, SHOWN)}"
 
 

@@ -22,7 +22,7 @@ REQUIRED = ("sigma", *COUNTED)
 
 METHOD = ("task", "data", "prior", "options", "sigma", "chunk", "seed", "nfe")
 
-PLAYED = (*METHOD, "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
+PLAYED = (*METHOD, "temperature", "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
 """Of a policy's cell: see `policies.row`."""
 
 AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_steps", *COUNTED)

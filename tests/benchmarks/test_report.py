@@ -21,7 +21,7 @@ from lab.files import PartialFailure
 from tests.benchmarks.script_parts import is_png
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
-FACTS |= {"seed": 0, "iterations": 100, "checkpoint": 100, "nfe": 1}
+FACTS |= {"seed": 0, "iterations": 100, "checkpoint": 100, "nfe": 1, "temperature": 1.0}
 SIGMA = {"past": 0.5}
 
 
@@ -99,7 +99,7 @@ def test_a_summary_is_what_scipy_and_counting_say(top_k):
             """Of every seed the mean outcome of each episode, over the best checkpoints; ``[3, 6]``."""
             seeds = []
             for seed in range(3):
-                texts = [episodes[prior, data, seed, c, nfe] for c in (30, 60, 100)]
+                texts = [episodes[prior, data, seed, c, nfe] for c in (100, 60, 30)]
                 best = sorted(texts, key=lambda text: -text.count("1"))[:top_k]
                 seeds.append(np.mean([[int(x) for x in text] for text in best], 0))
             return np.array(seeds)
@@ -158,7 +158,7 @@ def test_the_report_has_the_layout_of_table_1():
     assert "- A note.\n" in text and "source_leak" not in text  # nobody measured it
 
 
-def test_measures_are_means_of_the_last_checkpoints_beside_the_baseline():
+def test_measures_are_of_the_chosen_checkpoints_beside_the_baseline():
     rows = [row(prior="regression", checkpoint=n, kappa=k) for n, k in ((50, 99.0), (100, 2.0))]
     measured = {"nfe": 9, "source_leak": 0.3, "inner_step_ratio": 1.5}
     for seed, kappa in enumerate((1.0, 3.0)):
@@ -240,3 +240,13 @@ def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
     assert memory.main(argv) == 2
     said = capsys.readouterr().err
     assert all(word in said for word in ("one/results.jsonl, line 1", "policy", "outcomes", "robomimic.py"))
+
+
+def test_a_temperature_is_a_column_and_compares_with_its_own():
+    rows = [row(5, temperature=1.0), row(2, temperature=0.5)]
+    rows += [row(6, prior="past", temperature=1.0), row(9, prior="past", temperature=0.5)]
+    found = report.summary(pd.DataFrame(rows), 1).set_index(["prior", "temperature"])
+    assert found.loc[("past", 1.0), "gain"] == pytest.approx(0.1)
+    assert found.loc[("past", 0.5), "gain"] == pytest.approx(0.7)
+    text = table(pd.DataFrame(rows))
+    assert "NFE 1, noise x 1: Base" in text and "NFE 1, noise x 0.5: WP-Past" in text

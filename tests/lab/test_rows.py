@@ -11,7 +11,13 @@ from lab.rows import AGENT, PLAYED, read_rows
 
 ROW = {
     **{"task": "lift", "data": "ph", "prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0},
-    **{"iterations": 30, "policy": "lift-ph-past-seed0-0123456789", "checkpoint": 30, "nfe": 9},
+    **{
+        "iterations": 30,
+        "policy": "lift-ph-past-seed0-0123456789",
+        "checkpoint": 30,
+        "nfe": 9,
+        "temperature": 1.0,
+    },
     **{"episodes": 4, "successes": 3, "success_rate": 0.75, "outcomes": "1011", "mean_steps": 31.5},
     **{"boundary_jump": None, "kappa": 0, "episode_side": 0.5, "training_seconds": 12.0},
 }

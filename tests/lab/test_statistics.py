@@ -53,7 +53,7 @@ def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, 
     nodes, weights = np.polynomial.legendre.leggauss(200)
     p = (nodes + 1) / 2
     expected = float((weights / 2 * a.pdf(p) * b.cdf(p)).sum())
-    assert probability_better(k_a, n_a, k_b, n_b) == pytest.approx(expected, abs=1e-9)
+    assert probability_better(k_a, n_a, k_b, n_b) == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize(("wins", "losses"), [(0, 0), (7, 2), (0, 5), (40, 41), (900, 100)])
@@ -62,5 +62,5 @@ def test_paired_probability_is_that_of_a_beta(wins, losses):
     found = paired_probability_better(wins, losses)
     assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
     assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
-    with pytest.raises(ValueError, match="at least 0"):
+    with pytest.raises(ValueError, match="between 0"):
         paired_probability_better(-1, losses)
