@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections import deque
+from collections.abc import Mapping
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from itertools import chain
@@ -18,10 +20,19 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.checks import check_between, check_finite, check_shape, check_whole_numbers
+from warmprior.checks import (
+    check_between,
+    check_finite,
+    check_finite_numbers,
+    check_positive,
+    check_shape,
+    check_whole_numbers,
+)
+from warmprior.deploy.observation import RobotObservation
 from warmprior.history import caught_up, cold_history
 from warmprior.modules.actor import check_usual_keys
-from warmprior.modules.network import uncompiled
+from warmprior.modules.encoder import ImageEncoder
+from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
@@ -44,6 +55,10 @@ class AsyncExecutor:
     most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again. Several threads
     can share an executor: their calls take turns.
 
+    Everything else is the policy's own: its normaliser, its stack of observations, and the names and sizes of
+    what it sees. Images of cameras may have any size: they are resized to that of the training, which the
+    encoder then crops in the middle.
+
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, a :class:`~warmprior.lerobot.LeRobotActor`, or any module
             that reads ``"observation"`` (or ``("prior", "observation")``, which includes the last actions),
@@ -51,7 +66,9 @@ class AsyncExecutor:
             is called without batch dimensions.
         prior: the policy's prior, of which only the lengths matter; the actor's own by default.
         execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
-        delay: expected delay in control steps until delays were measured.
+        delay: expected delay until delays were measured, in control steps, or in seconds with
+            ``control_rate``; one control step by default.
+        control_rate: control steps per second.
         window: how many last decisions to take the largest delay of.
         observation_steps: ``To``; that of the actor's network by default, or 2.
         normalizer: converts raw observations and actions; the actor's own by default. Without one they are in
@@ -82,7 +99,8 @@ class AsyncExecutor:
         *,
         prior: Prior | None = None,
         execute: int | None = None,
-        delay: int = 1,
+        delay: float | None = None,
+        control_rate: float | None = None,
         window: int = 10,
         observation_steps: int | None = None,
         normalizer: Normalizer | None = None,
@@ -103,15 +121,14 @@ class AsyncExecutor:
         check_usual_keys(actor, "AsyncExecutor")
         if prior is None or action_dim is None:
             raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
-        if latency is not None:
-            if pool is not None:
-                raise ValueError("a simulated latency computes in the calling thread: leave out pool")
-            delay = latency
+        if latency is not None and pool is not None:
+            raise ValueError("a simulated latency computes in the calling thread: leave out pool")
         check_whole_numbers(window=window, observation_steps=observation_steps)
         length = prior.prediction_length
+        expected = _steps(delay, control_rate) if latency is None else latency
         if execute is None:
-            execute = min(prior.chunk_length, length - delay)
-        check_delay(delay, execute, length)
+            execute = min(prior.chunk_length, length - expected)
+        check_delay(expected, execute, length)
         check_whole_numbers(execute=execute)
         check_between(1, prior.chunk_length, execute=execute)
         if normalizer is not None and keys.ACTION not in normalizer.keys:
@@ -128,12 +145,14 @@ class AsyncExecutor:
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
         self._reach = getattr(guidance, "horizon", None) or length
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
+        self._postprocess = getattr(plain, "postprocess", None)
+        self._observed = RobotObservation(_shapes(plain, network, prior), self._normalizer)
         self._sees_history = keys.CONDITIONED in actor.in_keys
         self._owned = None
         if pool is None and latency is None:
             self._owned = pool = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
         self._pool = pool
-        self._expected = delay
+        self._expected = expected
         self._delays: deque[int] = deque(maxlen=window)
         self._frames: deque[Tensor | TensorDictBase] = deque(maxlen=observation_steps)
         self._lock = RLock()
@@ -166,12 +185,16 @@ class AsyncExecutor:
             # The chunk as it is executed from the last decision on, and where it ends.
             self._chunk, self._end, self._executed = self._history["forecast"], 0, 0
 
-    def act(self, observation: Tensor | TensorDictBase) -> Tensor:
+    def act(self, observation: Tensor | TensorDictBase | Mapping[str, Any]) -> Tensor:
         """Return this control step's action, ``[d_a]`` on the CPU, for a raw observation.
 
-        That is ``[d_o]``, or a tensordict ``[]`` with several entries.
+        That is a vector ``[d_o]``, or a dictionary or tensordict with the vector ``"state"`` and the images
+        that the policy sees, under their names, uint8 ``[h, w, 3]`` or ``[3, h, w]``; other entries are
+        ignored. NumPy's arrays do as well.
 
         Raises:
+            KeyError: if an entry is missing; nothing has changed then.
+            ValueError: if one has another shape or is no image; likewise.
             TimeoutError: if no action is left, and the next chunk is not ready in time.
             RuntimeError: after :meth:`close`.
             Exception: the policy's own error, once no action is left. Until then, and at every further call,
@@ -189,9 +212,10 @@ class AsyncExecutor:
                 self._wait()
             action = self._chunk[self._executed]
             self._executed += 1
-        if self._normalizer is None:
-            return action.clone()
-        return self._normalizer.denormalize(TensorDict({keys.ACTION: action}))[keys.ACTION]
+        if self._normalizer is not None:
+            return self._normalizer.denormalize(TensorDict({keys.ACTION: action}))[keys.ACTION]
+        action = action.clone()
+        return action if self._postprocess is None else self._postprocess(action[None])[0].cpu()
 
     @property
     def _first(self) -> bool:
@@ -203,14 +227,11 @@ class AsyncExecutor:
         """Actions that are left to execute."""
         return self._end - self._executed
 
-    def _see(self, observation: Tensor | TensorDictBase) -> None:
-        if self._normalizer is not None:
-            data = TensorDict({keys.OBSERVATION: observation})
-            observation = self._normalizer.normalize(data)[keys.OBSERVATION]
-        observation = observation.clone()  # drivers may reuse the memory for the next one
-        self._frames.append(observation)
+    def _see(self, observation: Tensor | TensorDictBase | Mapping[str, Any]) -> None:
+        seen = self._observed(observation)
+        self._frames.append(seen)
         while len(self._frames) < (self._frames.maxlen or 0):
-            self._frames.append(observation)
+            self._frames.append(seen)
 
     def _decide(self) -> None:
         """Begin a decision; the rest of the chunk moves to the positions of the new one.
@@ -306,3 +327,31 @@ class AsyncExecutor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _steps(delay: float | None, control_rate: float | None) -> int:
+    """A delay in control steps, from seconds where the rate is given."""
+    if delay is None:
+        return 1
+    if control_rate is None:
+        if delay != int(delay):
+            raise ValueError(
+                f"delay must be a whole number of control steps, got {delay}: for seconds, give control_rate"
+            )
+        return int(delay)
+    check_positive(control_rate=control_rate)
+    check_finite_numbers(delay=delay)
+    return math.ceil(round(delay * control_rate, 6))
+
+
+def _shapes(actor: Any, network: Any, prior: Prior) -> Mapping[str, tuple[int, ...]] | None:
+    """Of what a policy sees in one step, by name; ``None`` if that is not known."""
+    if (shapes := getattr(actor, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
+        return shapes
+    encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
+    if encoder is not None or network.encodes:  # by a user's own encoder
+        return None if encoder is None else encoder.shapes
+    width = network.observation_dim
+    if keys.CONDITIONED in actor.in_keys:
+        width -= HistoryObservation.width(prior.chunk_length, network.action_dim)
+    return {keys.STATE: (width,)}

@@ -14,6 +14,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.checks import check_shape
 from warmprior.history import history_keys
+from warmprior.lerobot.adapter import WarmPriorAdapter
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
@@ -47,7 +48,8 @@ class LeRobotFlow(TensorDictModuleBase):
         # contain this.
         self._policy = (policy,)
         self.source = self.network = source  # which has the width of actions
-        self.names = dict(names or {})
+        inputs = policy.config.input_features
+        self.names = {n.rpartition(".")[2]: n for n in inputs} if names is None else dict(names)
         self.preprocess = preprocess
         self.seed = seed
         self.in_keys = [keys.NOISE, keys.OBSERVATION]
@@ -120,23 +122,26 @@ class LeRobotActor(TensorDictModuleBase):
     the environment.
 
     Args:
-        policy: of LeRobot, see :class:`WarmPriorAdapter`.
-        prior: the source distribution that it was trained with.
+        policy: of LeRobot, see :class:`WarmPriorAdapter`; or such an adapter.
+        prior: the source distribution that it was trained with; by default that of the adapter, or of a
+            policy of the plugin.
 
     Keyword Args:
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
         names: LeRobot's name of each entry of the observation, such as
-            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; an observation
-            that is a tensor ``[*B, To, d]`` is ``observation.state``. Images of bytes become floats in
-            [0, 1].
+            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; by default the
+            last part of LeRobot's. An observation that is a tensor ``[*B, To, d]`` is ``observation.state``.
+            Images of bytes become floats in [0, 1].
         preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
             default.
+        postprocess: turns actions ``[1, d_a]`` into those of a robot, such as LeRobot's postprocessor, for
+            :class:`~warmprior.deploy.AsyncExecutor`; none by default.
         nfe: integration steps per chunk; the policy's own by default.
         seed: of the padding under a decoder.
 
     Raises:
-        ValueError: see :class:`WarmPriorAdapter`.
+        ValueError: see :class:`WarmPriorAdapter`; or if the prior is missing, or an adapter has guidance.
         KeyError: (when called) if an entry of the history is missing.
 
     Examples:
@@ -156,20 +161,34 @@ class LeRobotActor(TensorDictModuleBase):
     def __init__(
         self,
         policy: Any,
-        prior: Prior,
+        prior: Prior | None = None,
         *,
         std: Tensor | None = None,
         generator: torch.Generator | None = None,
         names: Mapping[str, str] | None = None,
         preprocess: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        postprocess: Callable[[Tensor], Tensor] | None = None,
         nfe: int | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
+        own = policy if isinstance(policy, WarmPriorAdapter) else getattr(policy, "warm_adapter", None)
+        adapter: WarmPriorAdapter | None = own
+        if adapter is not None:
+            policy = adapter.policy
+            if adapter.guidance is not None:
+                raise ValueError("LeRobotActor has no guidance: give it an adapter without")
+            nfe = adapter.nfe if nfe is None else nfe
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError("relative actions (use_relative_actions) need WarmPriorAdapter")
-        source = ChunkSource(policy, prior, std)
+        if prior is not None:
+            source = ChunkSource(policy, prior, std)
+        elif adapter is not None:
+            source = adapter.source
+        else:
+            raise ValueError(f"{type(policy).__name__} has no prior of its own: give LeRobotActor one")
         self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
+        self.postprocess = postprocess
         self.network = self.ode.network
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *history_keys()]
@@ -184,6 +203,14 @@ class LeRobotActor(TensorDictModuleBase):
     def sampling(self) -> Sampling:
         """How a chunk is drawn."""
         return self.ode.sampling
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]] | None:
+        """Of one step's entries, by name; ``None`` where some are for ``preprocess`` alone."""
+        features, names = self.ode.policy.config.input_features, self.ode.names
+        if not set(names.values()) <= set(features):
+            return None
+        return {name: tuple(features[entry].shape) for name, entry in names.items()}
 
     @property
     def device(self) -> torch.device:

@@ -171,9 +171,14 @@ class ImageEncoder(nn.Module):
         ]
         return window.unflatten(1, images.shape[1:3])
 
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of one step's entries, in the order in which they are encoded."""
+        vector: dict[str, tuple[int, ...]] = {keys.STATE: (self.state_dim,)} if self.state_dim else {}
+        return vector | dict.fromkeys(self.cameras, (3, self.image_size, self.image_size))
+
     def _check(self, observation: TensorDictBase) -> None:
-        shapes: dict[str, tuple[int, ...]] = {keys.STATE: (self.state_dim,)} if self.state_dim else {}
-        shapes |= dict.fromkeys(self.cameras, (3, self.image_size, self.image_size))
+        shapes = self.shapes
         check_keys(observation, shapes, "the encoder", f"; there are {sorted(map(str, observation.keys()))}")
         for name, shape in shapes.items():
             value = observation[name]
