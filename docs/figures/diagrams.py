@@ -15,7 +15,6 @@ OUT = Path(__file__).parents[1] / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior,\nsmall sigma", BLUE),
-    ("Do chunks take effect late?", "PreviewPrior\nwith guidance", ORANGE),
     ("Are actions absolute arm poses?", "GaussianPrior", GREY),
     ("Nine steps, many demonstrations?", "GaussianPrior", GREY),
     ("At most 25 demonstrations?", "PastPrior or\nPreviewPrior", BLUE),
@@ -42,10 +41,10 @@ def box(
 
 def flowchart() -> None:
     """Chart H: which source to take."""
-    made, axis = canvas(6.0, 6.2)
-    left, right, step = 17.0, 48.5, 10.2
+    made, axis = canvas(6.0, 5.2)
+    left, right, step, top = 17.0, 48.5, 10.2, 46.0
     for k, (question, answer, color) in enumerate(QUESTIONS):
-        y = 56 - step * k
+        y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
         box(axis, (right, y), (20, 6.4), answer, fc=color, ec=color, color="white")
         arrow = {"arrowstyle": "-|>", "color": "0.3"}
@@ -55,7 +54,7 @@ def flowchart() -> None:
         axis.text(left + 0.8, y - step / 2 - 0.8, "no", fontsize=10)
     box(
         axis,
-        (left, 56 - step * 5),
+        (left, top - step * len(QUESTIONS)),
         (30, 6.4),
         "PastPrior(8, correlation=0.5)",
         fc=BLUE,
