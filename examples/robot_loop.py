@@ -31,6 +31,9 @@ from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 PATIENCE = 1.0
 """Seconds for which the robot is held before the loop gives up."""
 
+DELAY = 0.05
+"""The longest decision that is expected, in seconds."""
+
 CHUNK, NFE = 8, 3
 
 
@@ -86,7 +89,7 @@ def run(robot: Robot, policy: WarmPriorActor, rate: float, seconds: float) -> Re
     in any case.
     """
     period, record = 1 / rate, Record()
-    with AsyncExecutor(policy, delay=0.05, control_rate=rate) as executor:
+    with AsyncExecutor(policy, delay=DELAY, control_rate=rate) as executor:
         try:
             robot.connect()
             executor.act(robot.observe())  # the first decision takes longest, and the robot rests

@@ -9,6 +9,8 @@ import torch
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
+collect_ignore = ["robot"]  # a package of LeRobot's, for other processes
+
 
 @pytest.fixture(scope="session")
 def built():

@@ -164,6 +164,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         """Average the weights: LeRobot calls it after every step of a training."""
         self.averaged.update_parameters(self.actor.network)
 
+    @property
+    def acting(self) -> WarmPriorActor:
+        """The actor with the weights that play: the averaged ones, once there are any."""
+        return self.actor.replace(network=self.averaged.module) if self.averaged.n_averaged else self.actor
+
     def get_optim_params(self) -> Any:
         """Weights that decay, and those that do not."""
         return self.actor.network.parameter_groups(self.config.optimizer_weight_decay)
@@ -262,10 +267,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         first = seen[self.config.observed[0]]
         history = self._memory.decide(len(first), first.device)
         data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, history.shape)
-        acting = self.actor
-        if self.averaged.n_averaged:
-            acting = acting.replace(network=self.averaged.module)
-        chunk = acting(data)[keys.CHUNK]
+        chunk = self.acting(data)[keys.CHUNK]
         self._memory.record(chunk)
         return chunk
 

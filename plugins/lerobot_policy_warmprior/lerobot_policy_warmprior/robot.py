@@ -1,0 +1,77 @@
+"""Policies that LeRobot has trained, for :class:`warmprior.deploy.AsyncExecutor`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.processor import NormalizerProcessorStep
+from torch import Tensor
+
+from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
+from warmprior import Normalizer, WarmPriorActor, keys
+from warmprior.lerobot import LeRobotActor
+from warmprior.modules.encoder import ImageEncoder
+
+
+def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> WarmPriorActor | LeRobotActor:
+    """A saved policy of the plugin that acts on raw observations, in the units of the demonstrations.
+
+    It has the processors that LeRobot saved beside it. Cameras have the last part of LeRobot's names:
+    ``"front"`` for ``observation.images.front``. The ``"state"`` of a ``warm_flow`` policy is all of its
+    vectors in their order, ``observation.environment_state`` before ``observation.state``.
+
+    Args:
+        place: a folder, such as ``run/checkpoints/last/pretrained_model``, or a repository of the hub.
+
+    Keyword Args:
+        task: what it is to do, for policies that read language.
+        device: where it computes.
+
+    Raises:
+        ValueError: if a ``warm_flow`` policy has another normalisation than by extremes.
+    """
+    config = PreTrainedConfig.from_pretrained(str(place))
+    config.device = device
+    policy = get_policy_class(config.type).from_pretrained(str(place), config=config).to(device).eval()
+    before, after = make_pre_post_processors(
+        config, pretrained_path=str(place), preprocessor_overrides={"device_processor": {"device": device}}
+    )
+    if isinstance(policy, WarmFlowPolicy):
+        return _flow_actor(policy, before)
+
+    def preprocess(batch: dict[str, Any]) -> dict[str, Any]:
+        return before({**batch, "task": [task] * len(next(iter(batch.values())))})
+
+    return LeRobotActor(policy, preprocess=preprocess, postprocess=after)
+
+
+def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
+    """The averaged weights, which play, with the extremes that LeRobot saved as the normaliser."""
+    config = policy.config
+    modes = {config.normalization_mapping.get(kind) for kind in ("STATE", "ENV", "ACTION")}
+    if modes != {NormalizationMode.MIN_MAX}:
+        raise ValueError(
+            f"load_actor knows the normalisation MIN_MAX of warm_flow, not {config.normalization_mapping}"
+        )
+    stats = next(step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)).stats
+    seen = (keys.OBSERVATION, keys.STATE) if config.image_features else keys.OBSERVATION
+    bounds = [_bounds(stats[name]) for name in config.observed]
+    low, high = (torch.cat(ends) for ends in zip(*bounds, strict=True))
+    least, most = _bounds(stats[keys.ACTION])
+    actor = policy.acting
+    for part in actor.network.modules():
+        if isinstance(part, ImageEncoder):
+            part.cameras = tuple(name.rpartition(".")[2] for name in part.cameras)
+    normalizer = Normalizer({seen: low, keys.ACTION: least}, {seen: high, keys.ACTION: most})
+    return actor.replace(normalizer=normalizer)
+
+
+def _bounds(stats: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    """Minimum and maximum; above a dimension that never changes, which LeRobot normalises to -1."""
+    low, high = (torch.as_tensor(stats[name], dtype=torch.float32).flatten() for name in ("min", "max"))
+    return low, torch.where(high > low, high, low + 2.5e-5 * low.abs().clamp_min(1.0))

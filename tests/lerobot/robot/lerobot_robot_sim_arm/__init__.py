@@ -1,0 +1,118 @@
+"""A simulated arm with a camera, and its leader, as a package that LeRobot finds by its name."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.robots import Robot, RobotConfig
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+
+JOINTS = ("shoulder.pos", "elbow.pos")
+
+
+@RobotConfig.register_subclass("sim_arm")
+@dataclass(kw_only=True)
+class SimArmConfig(RobotConfig):
+    """Where the arm writes the actions that it was sent, if anywhere."""
+
+    log: str = ""
+
+
+class SimArm(Robot):
+    """Two joints that go half of the way to their targets at every step."""
+
+    config_class, name = SimArmConfig, "sim_arm"
+    cameras = {"front": None}  # noqa: RUF012
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.config, self.connected, self.joints, self.sent = config, False, dict.fromkeys(JOINTS, 0.0), []
+
+    @property
+    def observation_features(self):
+        return {**dict.fromkeys(JOINTS, float), "front": (48, 64, 3)}
+
+    @property
+    def action_features(self):
+        return dict.fromkeys(JOINTS, float)
+
+    @property
+    def is_connected(self):
+        return self.connected
+
+    @property
+    def is_calibrated(self):
+        return True
+
+    def connect(self, calibrate=True):
+        self.connected = True
+
+    def calibrate(self):
+        pass
+
+    def configure(self):
+        pass
+
+    def get_observation(self):
+        image = np.zeros((48, 64, 3), np.uint8)
+        image[:, : int(32 * (1 + self.joints[JOINTS[0]])) % 64] = 200
+        return {**self.joints, "front": image}
+
+    def send_action(self, action):
+        self.sent.append([action[name] for name in JOINTS])
+        self.joints = {name: (self.joints[name] + action[name]) / 2 for name in JOINTS}
+        return action
+
+    def disconnect(self):
+        self.connected = False
+        if self.config.log:
+            Path(self.config.log).write_text(json.dumps(self.sent))
+
+
+@TeleoperatorConfig.register_subclass("sim_leader")
+@dataclass
+class SimLeaderConfig(TeleoperatorConfig):
+    """Without options."""
+
+
+class SimLeader(Teleoperator):
+    """Moves both joints to and fro."""
+
+    config_class, name = SimLeaderConfig, "sim_leader"
+    feedback_features = {}  # noqa: RUF012
+    is_calibrated = True
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.connected = False
+
+    @property
+    def action_features(self):
+        return dict.fromkeys(JOINTS, float)
+
+    @property
+    def is_connected(self):
+        return self.connected
+
+    def connect(self, calibrate=True):
+        self.connected = True
+
+    def calibrate(self):
+        pass
+
+    def configure(self):
+        pass
+
+    def get_action(self):
+        return {name: 0.5 * math.sin(3 * time.monotonic() + k) for k, name in enumerate(JOINTS)}
+
+    def send_feedback(self, feedback):
+        pass
+
+    def disconnect(self):
+        self.connected = False

@@ -1,0 +1,197 @@
+"""LeRobot's policies on a robot: in the executor, and in LeRobot's own loop with a robot of a package."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.lerobot.test_actor import preprocessed
+from tests.lerobot.test_plugin import warm
+from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
+from warmprior import PastPrior, RealTimeChunking
+from warmprior.deploy import AsyncExecutor
+from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
+
+pytest.importorskip("lerobot")
+pytest.importorskip("lerobot_policy_warmprior")
+pytest.importorskip("transformers")
+
+from lerobot.configs.types import FeatureType, PolicyFeature
+
+ROBOT = Path(__file__).parent / "robot"
+
+
+def observations(steps, side):
+    generator = np.random.default_rng(0)
+    for _ in range(steps):
+        image = generator.integers(0, 256, (side, side, 3), np.uint8)
+        yield {"state": generator.normal(size=STATE), "top": image, "battery": 0.5}
+
+
+@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+def test_a_warm_policy_acts_as_its_own_loop_does(found, name):
+    """Actions in a robot's units, from observations as drivers return them."""
+    torch.manual_seed(0)
+    policy = warm(found, name, prior="past", n_action_steps=LENGTH).eval()
+    policy.reset()
+    expected, seen = [], list(observations(2 * LENGTH + 1, 64))
+    torch.manual_seed(1)
+    for observation in seen:
+        batch = {
+            "observation.state": torch.tensor(observation["state"], dtype=torch.float32)[None],
+            CAMERA: torch.from_numpy(observation["top"]).permute(2, 0, 1)[None] / 255,
+        }
+        expected.append(10 * policy.select_action(preprocessed(batch))[0])
+
+    def preprocess(batch):
+        return preprocessed({key: value.float() for key, value in batch.items()})
+
+    actor = LeRobotActor(policy, preprocess=preprocess, postprocess=lambda action: 10 * action)
+    with AsyncExecutor(actor, latency=0) as executor:
+        torch.manual_seed(1)
+        found_actions = torch.stack([executor.act(observation) for observation in seen])
+        assert executor.execute == LENGTH
+        with pytest.raises(KeyError, match="top"):
+            executor.act({"state": np.zeros(STATE)})
+    assert found_actions.shape == (2 * LENGTH + 1, ACTION)
+    torch.testing.assert_close(found_actions, torch.stack(expected))
+
+
+def test_an_adapter_brings_policy_and_prior(policy):
+    made, prior = policy("smolvla"), PastPrior(LENGTH)
+    actor = LeRobotActor(WarmPriorAdapter(made, prior, nfe=2), preprocess=preprocessed)
+    assert actor.prior is prior and actor.sampling.nfe == 2 and actor.ode.policy is made
+    with pytest.raises(ValueError, match="prior"):
+        LeRobotActor(made)
+    guided = WarmPriorAdapter(policy("smolvla", n_action_steps=2), prior, guidance=RealTimeChunking())
+    with pytest.raises(ValueError, match="guidance"):
+        LeRobotActor(guided)
+
+
+STATS = {
+    "observation.state": {"min": np.full(STATE, -2.0), "max": np.array([4.0] * (STATE - 1) + [-2.0])},
+    "action": {"min": np.full(2, -3.0), "max": np.array([7.0, -3.0])},
+}
+"""The last dimension of both never changes."""
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_a_warm_flow_policy_acts_by_its_averaged_weights(found, tmp_path, camera):
+    from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
+    from lerobot_policy_warmprior.robot import load_actor
+
+    kind, side = found["warm_flow"], 32
+    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(STATE,))}
+    if camera:
+        inputs[CAMERA] = PolicyFeature(type=FeatureType.VISUAL, shape=(3, side, side))
+    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "device": "cpu"}
+    config = kind.config_class(
+        input_features=inputs,
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))},
+        precondition=False,
+        nfe=2,
+        image_size=side,
+        crop_size=28,
+        **small,
+    )
+    torch.manual_seed(0)
+    policy = kind(config)
+    with torch.no_grad():
+        for weight in policy.actor.network.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+        policy.update()
+        for weight in policy.actor.network.parameters():
+            weight.add_(0.5)
+    policy.save_pretrained(tmp_path)
+    stats = {name: {end: torch.tensor(v).float() for end, v in of.items()} for name, of in STATS.items()}
+    before, after = make_warm_flow_pre_post_processors(config, stats)
+    for pipeline in (before, after):
+        pipeline.save_pretrained(tmp_path)
+    seen, expected = list(observations(12, side)), []
+    torch.manual_seed(1)
+    policy.reset()
+    for observation in seen:
+        observation["state"][-1] = -2.0
+        batch = {"observation.state": torch.tensor(observation["state"]).float()[None]}
+        batch[CAMERA] = torch.from_numpy(observation["top"]).permute(2, 0, 1)[None] / 255
+        expected.append(after(policy.select_action(before(batch)))[0])
+    actor = load_actor(tmp_path)
+    torch.manual_seed(1)
+    with AsyncExecutor(actor, latency=0) as executor:
+        actions = [executor.act(observation) for observation in seen]
+    torch.testing.assert_close(torch.stack(actions), torch.stack(expected), rtol=1e-4, atol=1e-4)
+    assert torch.stack(expected)[:, 0].std() > 0.01
+
+
+def test_a_saved_vla_is_loaded_with_its_processors(found, tmp_path, monkeypatch):
+    from lerobot_policy_warmprior import robot
+
+    policy = warm(found, "warm_smolvla", prior="past", n_action_steps=LENGTH).eval()
+    policy.save_pretrained(tmp_path)
+    tasks = []
+
+    def before(batch):
+        tasks.append(batch.pop("task"))
+        return preprocessed({key: value.float() for key, value in batch.items()})
+
+    # The tokeniser of LeRobot's is on the hub, and so is the backbone's configuration.
+    monkeypatch.setattr(
+        robot, "make_pre_post_processors", lambda *args, **options: (before, lambda a: a + 100)
+    )
+    monkeypatch.setattr(type(policy), "from_pretrained", classmethod(lambda kind, *args, **options: policy))
+    with AsyncExecutor(robot.load_actor(tmp_path, task="wave"), latency=0) as executor:
+        action = executor.act(next(iter(observations(1, 64))))
+    assert tasks == [["wave"]] and action.shape == (ACTION,) and action.min() > 50
+
+
+@pytest.mark.slow
+def test_lerobots_own_loop_runs_a_policy_on_a_robot_of_a_package(tmp_path):
+    """Record by a leader, train, run, and record what the policy does; as the page on LeRobot says it."""
+    scripts = Path(sys.executable).parent
+    if not (scripts / "lerobot-rollout").exists():
+        pytest.skip("this release of lerobot has no lerobot-rollout")
+    paths = [str(ROBOT), os.environ.get("PYTHONPATH", "")]
+    options = os.environ | {
+        "PYTHONPATH": os.pathsep.join(path for path in paths if path),
+        "HF_LEROBOT_HOME": str(tmp_path / "home"),
+        "HF_HUB_OFFLINE": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+
+    def run(script, *argv):
+        command = [sys.executable, str(scripts / script), *argv]
+        done = subprocess.run(command, env=options, capture_output=True, text=True, check=False, timeout=600)
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    robot = ["--robot.type=sim_arm", "--robot.id=a", "--play_sounds=false"]
+    recorded = [
+        *("--dataset.num_episodes=2", "--dataset.episode_time_s=2", "--dataset.reset_time_s=0"),
+        *("--dataset.fps=20", "--dataset.push_to_hub=false", "--dataset.video=false"),
+        "--dataset.single_task=wave",
+    ]
+    data = ["--dataset.repo_id=local/arm", f"--dataset.root={tmp_path / 'arm'}"]
+    run("lerobot-record", *robot, "--teleop.type=sim_leader", *data, *recorded)
+    network = "--policy.embedding_dim=32 --policy.num_layers=1 --policy.num_heads=2 --policy.encoder=small"
+    sizes = "--policy.image_size=32 --policy.crop_size=28 --policy.nfe=1 --policy.device=cpu"
+    recipe = "--batch_size=4 --num_workers=0 --steps=3 --save_freq=3 --policy.push_to_hub=false"
+    train = ["--policy.type=warm_flow", *network.split(), *sizes.split(), *recipe.split()]
+    run("lerobot-train", *train, *data, f"--output_dir={tmp_path / 'run'}")
+    policy = f"--policy.path={tmp_path / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}"
+    rollout = ["--fps=20", "--return_to_initial_position=false", policy, *robot]
+    run("lerobot-rollout", *rollout, f"--robot.log={tmp_path / 'sent.json'}", "--duration=2", "--task=wave")
+    sent = np.array(json.loads((tmp_path / "sent.json").read_text()))
+    assert 20 <= len(sent) <= 41 and np.isfinite(sent).all()
+    assert np.abs(sent).max() <= 0.51  # targets of the demonstrations
+    kept = ["--dataset.repo_id=local/rollout_arm", f"--dataset.root={tmp_path / 'rollout'}"]
+    run("lerobot-rollout", *rollout, "--strategy.type=episodic", *kept, *recorded)
+    from warmprior.data import lerobot_steps
+
+    steps = lerobot_steps(tmp_path / "rollout", ["observation.state"])
+    assert len(steps["episode"].unique()) == 2 and steps["action"].abs().max() <= 0.51
