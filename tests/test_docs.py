@@ -20,7 +20,9 @@ DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
 SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
+    "warmprior.data.MinariDemonstrations": "needs a dataset",
     "warmprior.data.lerobot_steps": "needs a dataset",
+    "warmprior.data.observe_recordings": "needs a recording",
     "warmprior.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",

@@ -339,10 +339,10 @@ class Cell:
 
     checkpoint: int  # of the policy's training, an iteration
     nfe: int  # network evaluations per chunk
-    temperature: float = 1.0  # factor of the source's noise
     delay: int | None = None  # control steps until chunks take effect; None: the simulator waits
     execute: int | None = None  # actions per decision; all H by default
     guidance: RealTimeChunking | None = None
+    temperature: float = 1.0  # factor of the source's noise
 
     def facts(self) -> dict[str, Any]:
         found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}

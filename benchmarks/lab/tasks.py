@@ -109,7 +109,7 @@ class DataOptions:
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         mask: name of a mask in the file, such as train; only its demonstrations are used.
-        horizon: control steps per episode of a Minari dataset's environment (default: its own).
+        time_limit: control steps per episode of a Minari dataset's environment (default: its own).
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
         actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
@@ -131,7 +131,7 @@ class DataOptions:
     download: bool = False
     force_download: bool = False
     mask: str | None = None
-    horizon: int | None = None
+    time_limit: int | None = None
     demonstrations: tuple[int, ...] = ()
     actions: Literal["delta", "absolute"] = "delta"
     obs: Literal["state", "image"] = "state"
@@ -140,7 +140,7 @@ class DataOptions:
     fast_rendering: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, "demonstrations", "image_size", "horizon")
+        check_counts(self, "demonstrations", "image_size", "time_limit")
         if len(self.demonstrations) > 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got {self.demonstrations}"
@@ -250,7 +250,7 @@ def robosuite_task(
         actions=options.actions,
         mask=options.mask,
         demos=demos,
-        horizon=options.horizon,
+        horizon=options.time_limit,
         **seen,
     )
     if task.environment is None:

@@ -51,7 +51,7 @@ def throughputs(folder, *argv):
 def test_throughput_writes_every_key(tmp_path):
     results = throughputs(tmp_path, "--only", "windows_over_torch", "preconditioning_over_network")
     found = {key for key, value in results.items() if value is not None}
-    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 10
+    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 11
     assert min(results["windows_over_torch"].values()) > 0 and results["preconditioning_over_network"] > 0
 
 

@@ -102,5 +102,5 @@ def test_a_description_with_more_or_less_builds_nothing(change):
         if value is None:
             del described[name]
     policy = WarmPriorActor(VelocityMLP(7, 19, 4, hidden_dim=16), PastPrior(4), environment=described)
-    with pytest.raises(ValueError, match="keeps no description of a robosuite environment"):
+    with pytest.raises(ValueError, match="keeps no description of an environment"):
         environment_of(policy)
