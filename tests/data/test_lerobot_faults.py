@@ -193,7 +193,7 @@ def test_masks_and_episodes_are_some_of_those_that_there_are(root):
     described(observations=STATE, masks={"none": [], "more": [0, 3], "floats": [0.5], "ok": [2, 0]})(root)
     seen = {"observation_keys": ["observation.state"]}
     for options in ({"filter_key": "none"}, {"episodes": []}, {"filter_key": "ok", "episodes": [1]}):
-        with pytest.raises(DatasetError, match="no demonstrations"):
+        with pytest.raises(DatasetError, match="the mask"):
             LeRobotDemonstrations(root, **options, **seen)
     assert LeRobotDemonstrations(root, filter_key="ok", episodes=[2], **seen).num_episodes == 1
     for name in ("more", "floats"):

@@ -295,6 +295,8 @@ def read_lerobot_index(
         if filter_key not in masks:
             raise unknown(root, "filter key", filter_key, masks)
         chosen = _chosen(root, f"the mask {filter_key!r}", masks[filter_key], count)
+        if not chosen:
+            raise DatasetError(f"{root}: the mask {filter_key!r} names no episode: choose another, or none")
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demos, len(rows))
     rows = rows[:demos]
