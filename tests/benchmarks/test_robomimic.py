@@ -79,8 +79,8 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
     """SIGKILL at 20 moments: while it starts, trains, saves, measures, plays and writes."""
 
     def launch(out):
-        few = {"iterations": 600, "save_every": 20, "checkpoints": 3, "episodes": 3, "envs": 2}
-        argv = [*options(dataset, out, **few, prior=["gaussian", "past"]), "--no-films"]
+        few = {"iterations": 600, "save_every": 20, "checkpoints": 2, "episodes": 2, "prior": "past"}
+        argv = [*options(dataset, out, **few), "--no-films"]
         argv += ["--resume"] if (out / "options.json").exists() else []
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         return subprocess.Popen([sys.executable, robomimic.__file__, *argv], start_new_session=True, **quiet)
@@ -95,7 +95,7 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
     assert launch(undisturbed).wait() == 0
     duration = time.monotonic() - begun
     rows, weights = results(undisturbed)
-    assert len(rows) == 2 * 3 and len(weights) == 2 * 3
+    assert len(rows) == len(weights) == 2
     rng, kills, runs = np.random.default_rng(0), 0, 0
     out = tmp_path / "0" / "out"
     while True:
@@ -106,6 +106,7 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
             os.killpg(process.pid, signal.SIGKILL)
             assert process.wait() == -signal.SIGKILL
             kills += 1
+            print(f"killed {kills} times, {runs} runs to the end")
             continue
         mine, theirs = results(out)
         assert mine == rows and theirs.keys() == weights.keys()
