@@ -106,7 +106,6 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
             os.killpg(process.pid, signal.SIGKILL)
             assert process.wait() == -signal.SIGKILL
             kills += 1
-            print(f"killed {kills} times, {runs} runs to the end")
             continue
         mine, theirs = results(out)
         assert mine == rows and theirs.keys() == weights.keys()
