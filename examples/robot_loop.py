@@ -38,7 +38,7 @@ CHUNK, NFE = 8, 3
 
 
 class Robot(Protocol):
-    """What the loop needs of a robot."""
+    """The loop calls these methods of a robot."""
 
     def connect(self) -> None:
         """Open the connection; the robot may move from here on."""

@@ -345,8 +345,11 @@ class Cell:
     temperature: float = 1.0  # factor of the source's noise
 
     def facts(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
-        found["temperature"] = self.temperature
+        found: dict[str, Any] = {
+            "checkpoint": self.checkpoint,
+            "nfe": self.nfe,
+            "temperature": self.temperature,
+        }
         if self.delay is not None:
             guidance = "none" if self.guidance is None else "rtc"
             found |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}

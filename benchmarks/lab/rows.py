@@ -15,7 +15,7 @@ from lab.columns import IDENTITY, column
 from lab.files import read_lines
 
 COUNTED = ("episodes", "successes", "success_rate")
-"""What every row of played episodes has."""
+"""Every row of played episodes has these columns."""
 
 REQUIRED = ("sigma", *COUNTED)
 """Numbers that are never null."""
@@ -23,10 +23,10 @@ REQUIRED = ("sigma", *COUNTED)
 METHOD = ("task", "data", "prior", "options", "sigma", "chunk", "seed", "nfe")
 
 PLAYED = (*METHOD, "temperature", "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
-"""Of a policy's cell: see `policies.row`."""
+"""A row of a policy's cell has these columns: `policies.row` writes them."""
 
 AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_steps", *COUNTED)
-"""Of an agent's evaluation."""
+"""A row of an agent's evaluation has these columns."""
 
 
 def read_rows(
@@ -84,7 +84,7 @@ def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
 
 
 def _fits(value: Any, form: str) -> bool:
-    """Whether a value has the type of a column's format."""
+    """Return whether a value has the type that a column's format says."""
     if form == "":
         return isinstance(value, str)
     number = int if form == "d" else (int, float)

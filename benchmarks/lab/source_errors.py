@@ -1,4 +1,4 @@
-"""How far a source is from the demonstrations, and from what its policy then does."""
+"""This module measures how far a source is from demonstrations, and from what its policy then does."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ RESAMPLES = 2_000
 
 
 GRID = np.linspace(0.0, 1.0, 20_001)
-"""Of rates, for the integral of :func:`probability_better`."""
+""":func:`probability_better` integrates over these rates."""
 
 
 def probability_better(successes_a: float, episodes_a: int, successes_b: float, episodes_b: int) -> float:

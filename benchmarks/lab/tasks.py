@@ -37,7 +37,7 @@ GENERATED = 150
 
 
 MOST = 10_000_000
-"""Of anything that is counted: more could neither be listed nor done."""
+"""No count may be larger: more could neither be listed nor done."""
 
 
 def is_simulated(task: str) -> bool:

@@ -75,7 +75,7 @@ def test_a_simulated_latency_is_that_of_the_environment(prior, execute, latency)
     assert not torch.equal(found[0], found[1])  # other noise
 
 
-class Told(TensorDictModuleBase):
+class Scripted(TensorDictModuleBase):
     """Action i of a chunk tells which step it was made at and which it is for; keeps what it was given."""
 
     def __init__(self, length):
@@ -125,7 +125,7 @@ def drive(executor, clock, ticks):
 def test_measured_delays_on_a_fake_clock():
     """P = 12, H = 6: decisions every 4 steps, or as soon as the last one took effect."""
     durations = [2, 1, 5, 1, 1, 1, 1]
-    clock, policy = FakeClock(durations), Told(12)
+    clock, policy = FakeClock(durations), Scripted(12)
     executor = AsyncExecutor(
         policy,
         prior=PreviewPrior(6),
@@ -189,7 +189,7 @@ def test_several_entries_raw_units_and_last_actions_that_networks_see():
         two = outside.act(row["observation"])
         torch.testing.assert_close(normalizer.denormalize(TensorDict({"action": one}))["action"], two)
 
-    class Nested(Told):
+    class Nested(Scripted):
         def forward(self, data):
             assert data["observation", "image"].shape == (2, 3, 4, 4)
             flat = data.clone().set("observation", data["observation", "state"])
@@ -203,7 +203,7 @@ def test_several_entries_raw_units_and_last_actions_that_networks_see():
 # ------------------------------------------------------------------------------------------ a real thread
 
 
-class Slow(Told):
+class Slow(Scripted):
     """Waits for leave from its second call on."""
 
     def __init__(self, length):
@@ -241,7 +241,7 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
         executor.act(torch.zeros(1))
 
 
-class Failing(Told):
+class Failing(Scripted):
     """Raises at the decisions whose numbers are named."""
 
     def __init__(self, length, fails):
@@ -320,7 +320,7 @@ def test_a_loop_in_inference_mode_has_guided_chunks():
 
 
 def test_chunks_that_no_robot_should_get():
-    class Wrong(Told):
+    class Wrong(Scripted):
         def forward(self, data):
             return data.set(self.out_keys[0], torch.full((self.length, 2), torch.nan))
 
@@ -328,7 +328,7 @@ def test_chunks_that_no_robot_should_get():
     with pytest.raises(FloatingPointError, match="NaN"):
         AsyncExecutor(Wrong(8), **usual).act(torch.zeros(1))
     with pytest.raises(ValueError, match=r"chunk has shape \[7, 2\], expected \[8, 2\]"):
-        AsyncExecutor(Told(7), **usual).act(torch.zeros(1))
+        AsyncExecutor(Scripted(7), **usual).act(torch.zeros(1))
 
 
 @pytest.mark.parametrize(
@@ -339,13 +339,13 @@ def test_chunks_that_no_robot_should_get():
         ({"latency": 1.5}, "delay must be a whole number"),
         ({"execute": 2.5}, "execute must be a whole number of at least 1, got 2.5"),
         ({"latency": 1, "pool": FakeClock([])}, "leave out pool"),
-        ({"prior": None}, "Told needs prior and action_dim"),
+        ({"prior": None}, "Scripted needs prior and action_dim"),
     ],
 )
 def test_options_that_cannot_be(options, said):
     usual = {"prior": GaussianPrior(8), "action_dim": 2}
     with pytest.raises(ValueError, match=said):
-        AsyncExecutor(Told(8), **(usual | options))
+        AsyncExecutor(Scripted(8), **(usual | options))
     assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]
 
 
@@ -431,7 +431,7 @@ def test_fifty_thousand_calls(prior):
     Some calls wait, and some do not.
     """
     length, remembered = prior.prediction_length, prior.history_length
-    policy, clock = Told(length), RandomClock(length, seed=0)
+    policy, clock = Scripted(length), RandomClock(length, seed=0)
     executor = AsyncExecutor(policy, prior=prior, action_dim=2, execute=5, observation_steps=1, pool=clock)
     done, errors, held, calls = [], 0, 0, 0
     while calls < CALLS:
@@ -468,7 +468,7 @@ def test_decisions_that_take_longer_than_what_is_remembered():
         clock = RandomClock(8, seed=0)
         clock.random = type("Always", (), {"random": lambda self: 0.5, "randint": lambda self, *ends: 6})()
         executor = AsyncExecutor(
-            Told(8), prior=PreviewPrior(4), action_dim=2, observation_steps=1, timeout=timeout, pool=clock
+            Scripted(8), prior=PreviewPrior(4), action_dim=2, observation_steps=1, timeout=timeout, pool=clock
         )
         found = []
         while len(found) < 60:
@@ -481,7 +481,7 @@ def test_decisions_that_take_longer_than_what_is_remembered():
 
 
 def test_several_threads_take_turns():
-    policy, found = Told(8), []
+    policy, found = Scripted(8), []
     with AsyncExecutor(
         policy, prior=PreviewPrior(4), action_dim=2, execute=3, observation_steps=1, timeout=None
     ) as executor:
@@ -650,7 +650,7 @@ def test_a_vector_may_be_the_state_among_others():
 
 
 def test_drivers_reuse_their_memory():
-    policy, memory = Told(8), np.zeros(1)
+    policy, memory = Scripted(8), np.zeros(1)
     with AsyncExecutor(policy, prior=PastPrior(8), action_dim=2, latency=0, execute=1) as executor:
         for tick in range(3):
             memory[:] = tick

@@ -162,7 +162,7 @@ def test_single_steps_are_not_skipped():
         env.rollout(2, POLICY)
 
 
-class Told(CountingEnv):
+class Instructed(CountingEnv):
     """Says what to do in words, beside the observation."""
 
     def __init__(self, length):
@@ -173,7 +173,7 @@ class Told(CountingEnv):
         return out.set("instruction", NonTensorData(f"step {self.t} of {self.length}"))
 
 
-def told(base):
+def instructions(base):
     env = TransformedEnv(base, policy_transforms(PRIOR))
     data, heard = env.reset(), []
     for _ in range(3):
@@ -186,8 +186,8 @@ def told(base):
 @pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
 def test_language_beside_the_observation(kind):
     lengths = (9, 6)
-    env = kind(2, [partial(Told, n) for n in lengths])
-    found, alone = told(env), [told(Told(n)) for n in lengths]
+    env = kind(2, [partial(Instructed, n) for n in lengths])
+    found, alone = instructions(env), [instructions(Instructed(n)) for n in lengths]
     assert found == [[[*a, *b] for a, b in zip(*step, strict=True)] for step in zip(*alone, strict=True)]
     assert found[1][1] == ["step 8 of 9", "step 6 of 6"]  # the second row rested for two steps
     env.close()

@@ -152,7 +152,7 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advi
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
-LOOKED_AT = 20  # demos from which it is told what actions are
+LOOKED_AT = 20  # demos that decide what actions are
 POSES = 0.25  # between 0.01, of poses a control step ahead of the hand, and 1, of what knows nothing of it
 
 
