@@ -226,21 +226,22 @@ def train(args: argparse.Namespace) -> None:
     saved = policy_path(folder, options.training.iterations)
     if left_out is not None:
         print(f"on the {count - task.facts['demonstrations']} demonstrations that were left out:")
-        for nfe, error in errors_of(actor, left_out, (1, 3, 9, options.nfe)).items():
+        steps = options.network.observation_steps
+        for nfe, error in errors_of(actor, left_out, steps, (1, 3, 9, options.nfe)).items():
             print(f"  NFE {nfe}: mean squared error of actions {error:.4f} (they range from -1 to 1)")
     if whole.environment is not None:
         print(f"play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
     print(saved)
 
 
-def errors_of(actor: WarmPriorActor, steps: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:
-    """Errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
+def errors_of(
+    actor: WarmPriorActor, data: TensorDictBase, observation_steps: int, nfes: Sequence[int]
+) -> dict[int, float]:
+    """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
     from warmprior.diagnostics import action_error, encoded_windows
-    from warmprior.modules.network import uncompiled
 
-    observed = getattr(uncompiled(actor.network), "observation_steps", 2)
-    windows = window_transforms(steps, actor.prior, observation_steps=observed)
-    frames = torch.linspace(0, len(steps) - 1, min(len(steps), 4096)).round().long()
+    windows = window_transforms(data, actor.prior, observation_steps=observation_steps)
+    frames = torch.linspace(0, len(data) - 1, min(len(data), 4096)).round().long()
     batch = encoded_windows(actor, windows(TensorDict({FRAME: frames}, [len(frames)])))
     return action_error(actor, batch, nfes=nfes)
 

@@ -43,8 +43,12 @@ class EnvTransform(Transform):
     ) -> TensorDictBase:
         """Begin the new episode of rows that the simulator has restarted; TorchRL merges nothing here."""
         rows = tensordict.get("_reset").view(tensordict.batch_size)
-        fresh = self._reset(tensordict, tensordict_reset.copy())
+        fresh = self._reset(tensordict, self._as_reset(tensordict_reset.copy()))
         return rows_where(rows, fresh, tensordict_reset)
+
+    def _as_reset(self, stepped: TensorDictBase) -> TensorDictBase:
+        """Return what a reset would give to this transform, from what its step has made of it."""
+        return stepped
 
     def _remember_ends(self, next_tensordict: TensorDictBase, names: Iterable[NestedKey]) -> None:
         """Remember what was written: with native autoresets TorchRL blanks all observations of an end."""

@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers
-from warmprior.transforms.inner_step import KEPT, EnvTransform, rows_where, set_aside
+from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
 
 class ObservationStack(EnvTransform):
@@ -89,15 +89,11 @@ class ObservationStack(EnvTransform):
         )
         return tensordict_reset.set(self.observation_key, stack)
 
-    def _reset_on_native_autoreset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _as_reset(self, stepped: TensorDictBase) -> TensorDictBase:
         # The step has appended the new episode's first observation to the stack of the old one.
-        time = self._time(tensordict_reset)
-        newest = _each(lambda stack: stack.select(time, -1), tensordict_reset.get(self.observation_key))
-        first = tensordict_reset.copy().set(self.observation_key, newest)
-        rows = tensordict.get("_reset").view(tensordict.batch_size)
-        return rows_where(rows, self._reset(tensordict, first), tensordict_reset)
+        time = self._time(stepped)
+        newest = _each(lambda stack: stack.select(time, -1), stepped.get(self.observation_key))
+        return stepped.set(self.observation_key, newest)
 
     def _time(self, place: TensorDictBase | Composite) -> int:
         """Return the stack's dimension: behind those of the batch, and of a group's agents."""
