@@ -19,6 +19,7 @@ from lab.scripted.tasks import EXPERTS
 from tests.data.synthetic import env_args_14
 from tests.processes import apart
 from warmprior.envs import RobosuiteEnv, rendering_backend
+from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)
@@ -52,6 +53,27 @@ def test_specs(lift):
     assert lift.observation_spec["observation"].shape == (TASKS["lift"].observation_dim,)
     assert lift.action_spec.shape == (7,)
     torch.testing.assert_close(lift.action_spec.space.high, torch.ones(7))
+
+
+def test_absolute_joint_targets():
+    env_args = task_env_args("lift")
+    part = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+    env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"] = {
+        "type": "JOINT_POSITION",
+        "input_type": "absolute",
+        "kp": 300,
+        "interpolation": None,
+        "gripper": part["gripper"],
+    }
+    env = RobosuiteEnv(env_args=env_args, low_dim_keys=["robot0_joint_pos"])
+    assert env.control_loop == "robosuite"  # the lean one has OSC_POSE alone
+    panda = [2.8973, 1.7628, 2.8973, 3.0718, 2.8973, 3.7525, 2.8973]  # of Franka's data sheet, in radians
+    torch.testing.assert_close(env.action_spec.space.high, torch.tensor([*panda, 1.0]))
+    start = env.reset()["observation"]
+    target = start + torch.tensor([0.2, -0.1, 0.1, 0.2, -0.2, 0.1, 0.3])
+    path = play(env, [torch.cat([target, -torch.ones(1)])] * 25)
+    torch.testing.assert_close(path[-1], target, atol=0.02, rtol=0)
+    env.close()
 
 
 @pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from warmprior.checks import check_choice
 from warmprior.data.hdf5 import read_index, read_masks, read_origin
 from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
-from warmprior.data.replay import DatasetError, DatasetIndex, solved
+from warmprior.data.replay import DatasetError, DatasetIndex, declared_poses, solved
 from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
@@ -108,7 +108,8 @@ def _features(
         return {"dtype": dtype, "shape": shape, "names": names}
 
     arms, rest = divmod(index.action_dim, 7)
-    names = {"action": action_names(arms) if rest == 0 else None}
+    poses = not rest and declared_poses(index.path, index.env_args) is not None
+    names = {"action": action_names(arms) if poses else None}
     names |= {name: state_names(widths) for name, widths in layout.items()}
     sizes = {"action": index.action_dim} | {name: sum(w.values()) for name, w in layout.items()}
     pixels = (index.image_size, index.image_size, 3)

@@ -25,6 +25,7 @@ from warmprior.data.replay import (
     check_count,
     check_env_args,
     common_size,
+    declared_poses,
     pose_keys,
     store_finite,
     unknown,
@@ -340,7 +341,8 @@ def read_index(
             wanted += [f"obs/{key}" for key in pose_keys(width)]
         expected, whose = {}, env_args.get("env_name", str(path))
         if task is not None:
-            expected["actions"] = task.action_dim
+            if declared_poses(path, env_args) is not None:  # other controllers have other widths
+                expected["actions"] = task.action_dim
             if observation_keys is None:
                 expected["obs/object"] = task.object_dim
         lengths: list[int] = []
@@ -356,7 +358,7 @@ def read_index(
                 if widths[key] != width:
                     raise DatasetError(
                         f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. Use "
-                        "demos of one environment with pose-delta actions, or choose observation_keys."
+                        "demos of one environment and controller, or choose observation_keys."
                     )
             expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
             lengths.append(steps)

@@ -17,6 +17,7 @@ from warmprior.data.replay import (
     check_count,
     check_env_args,
     common_size,
+    declared_poses,
     pose_keys,
     unknown,
 )
@@ -379,7 +380,7 @@ def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task:
     name, control = env_args["env_name"], env_args["env_kwargs"].get("control_freq", 20)
     if metadata.fps != control:
         raise DatasetError(f"{root}: fps is {metadata.fps}, but {name} runs at {control} Hz: resample it")
-    if task is None:
+    if task is None or declared_poses(root, env_args) is None:
         return
     action = metadata.features["action"]
     if (columns := action["shape"][0]) != task.action_dim:

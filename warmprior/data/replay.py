@@ -114,6 +114,14 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
     return env_args
 
 
+def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] | None:
+    """See :func:`~warmprior.envs.env_args.declared_actions`; a ``DatasetError`` if a file's are no such."""
+    try:
+        return declared_actions(env_args)
+    except Exception as error:  # whatever their unexpected structure leads to
+        raise DatasetError(f"{path}: env_args do not suit these actions: {error!r}") from error
+
+
 def check_count(path: Path, demos: int | None, available: int) -> None:
     """Refuse to take no demonstrations, or more than there are."""
     if demos is not None:
@@ -352,9 +360,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         if storage == "memmap" and device.type != "cpu":
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         action_dim, declared, conventions = index.action_dim, None, None
+        if index.env_args and not as_recorded:
+            declared = declared_poses(index.path, index.env_args)
         if index.env_args or absolute_actions:
             try:
-                declared = None if as_recorded else declared_actions(index.env_args)
                 solved(torch.zeros(1), index.env_args)
                 conventions = delta_conventions(index.env_args) if absolute_actions else None
             except Exception as error:  # whatever their unexpected structure leads to

@@ -86,26 +86,19 @@ class Arm:
         return (controller.ref_pos, controller.ref_ori_mat), (qvel, qpos)
 
 
-def check_supported(env: Any) -> None:
-    """Refuse robots that are not of the kind that :class:`Arm` describes."""
-    for robot in env.robots:
-        composite = robot.composite_controller
-        parts = composite.part_controllers
-        controller = parts.get("right")
-        supported = (
-            composite.name == "BASIC"
-            and set(parts) == {"right", "right_gripper"}
-            and controller.name == "OSC_POSE"
-            and controller.impedance_mode == "fixed"
-            and controller.uncoupling
-            and controller.interpolator_pos is None
-            and controller.interpolator_ori is None
-        )
-        if not supported:
-            what = f"{type(composite).__name__} with {sorted(parts)}"
-            raise ValueError(
-                f"the lean loop has only plain OSC_POSE arms: control_loop='robosuite' for {what}"
-            )
+def is_plain_arm(robot: Any) -> bool:
+    """Whether a robot is of the kind that :class:`ControlLoop` steps: one OSC_POSE arm with a gripper."""
+    composite = robot.composite_controller
+    controller = composite.part_controllers.get("right")
+    return bool(
+        composite.name == "BASIC"
+        and set(composite.part_controllers) == {"right", "right_gripper"}
+        and controller.name == "OSC_POSE"
+        and controller.impedance_mode == "fixed"
+        and controller.uncoupling
+        and controller.interpolator_pos is None
+        and controller.interpolator_ori is None
+    )
 
 
 @functools.cache
@@ -254,7 +247,13 @@ class ControlLoop(StepLoop):
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
-        check_supported(env)
+        for robot in env.robots:
+            if not is_plain_arm(robot):
+                composite = robot.composite_controller
+                what = f"{type(composite).__name__} with {sorted(composite.part_controllers)}"
+                raise ValueError(
+                    f"the lean loop has only plain OSC_POSE arms: control_loop='robosuite' for {what}"
+                )
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
         super().__init__(env, keys)

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.checks import check_choice, check_whole_numbers
-from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.control_loop import ControlLoop, StepLoop, is_plain_arm
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
@@ -63,7 +63,7 @@ class RobosuiteEnv(EnvBase):
             arm's pose and gripper.
         horizon: time limit in control steps; by default the task's, or else the environment's own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`, ``"robosuite"`` for
-            ``env.step``.
+            ``env.step``; by default the first where it supports the robots.
         from_pixels: render ``camera`` at every step. Policies that see images need them at decisions alone,
             where :class:`~warmprior.transforms.CameraImages` renders them.
         camera: the camera rendered, or several; ``None`` for the task's first, or ``"agentview"``.
@@ -104,7 +104,7 @@ class RobosuiteEnv(EnvBase):
         style: str = "ph",
         low_dim_keys: Sequence[str] | None = None,
         horizon: int | None = None,
-        control_loop: Literal["lean", "robosuite"] = "lean",
+        control_loop: Literal["lean", "robosuite"] | None = None,
         from_pixels: bool = False,
         camera: str | Sequence[str] | None = None,
         camera_size: int | tuple[int, int] = 84,
@@ -120,7 +120,8 @@ class RobosuiteEnv(EnvBase):
         if sum(given is not None for given in (task, env_args, env)) != 1:
             raise ValueError("give one of task, env_args and env")
         check_choice("style", style, STYLES)
-        check_choice("control_loop", control_loop, _LOOPS)
+        if control_loop is not None:
+            check_choice("control_loop", control_loop, _LOOPS)
         check_whole_numbers(seed_stride=seed_stride, horizon=1 if horizon is None else horizon)
         size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
         if len(size) != 2 or min(size) < 1:
@@ -140,6 +141,8 @@ class RobosuiteEnv(EnvBase):
         super().__init__(device=device)
         self.task = spec
         self._env = env if env_args is None else make_simulator(env_args)
+        if control_loop is None:
+            control_loop = "lean" if all(map(is_plain_arm, self._env.robots)) else "robosuite"
         if horizon is None:
             # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
             # waits for a success that may never come.

@@ -146,13 +146,18 @@ def check_scene_stays(env: Any) -> None:
 def action_limits(env: Any) -> list[float]:
     """The largest magnitude of each entry of an environment's action.
 
-    Those of absolute poses, in metres and radians, only say what is worth sampling.
+    Those of absolute targets only say what is worth sampling: of joints their range in radians, of poses two
+    metres and half a turn.
     """
     limits: list[float] = []
     for robot in env.robots:
-        controller = robot.composite_controller.part_controllers.get("right")
-        if getattr(controller, "input_type", "delta") == "absolute":
-            limits += [2.0] * 3 + [np.pi] * 3 + [1.0] * (robot.action_dim - 6)
-        else:
-            limits += [1.0] * robot.action_dim
+        composite = robot.composite_controller
+        magnitudes = np.ones(robot.action_dim)
+        for part, (first, last) in composite._action_split_indexes.items():
+            controller = composite.part_controllers.get(part)
+            if getattr(controller, "input_type", "delta") == "absolute":
+                joints = np.abs(env.sim.model.jnt_range[controller.joint_index]).max(-1)
+                target = joints if controller.name == "JOINT_POSITION" else [2.0] * 3 + [np.pi] * 3
+                magnitudes[first:last] = target
+        limits += magnitudes.tolist()
     return limits

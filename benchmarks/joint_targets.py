@@ -1,0 +1,136 @@
+"""Absolute joint targets, which most arms record: the scripted square, played by a joint controller.
+
+python benchmarks/joint_targets.py --preset cpu --prior gaussian past preview past,correlation=0.5 --nfe 9 3 1
+python benchmarks/joint_targets.py --data mh --demonstrations 300
+
+A demonstration's joint positions one step on are the targets of a second arm, robosuite's JOINT_POSITION
+controller with absolute targets, as a follower arm gets those of its leader. What is recorded of the second
+arm, and solves the task, is the demonstration. Policies see the arm's joints, the gripper and the object.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from robomimic import run
+from tqdm import tqdm
+
+from lab.options import PRESETS, script, with_parts
+from lab.scripted.episode import Episode, write_robomimic
+from lab.scripted.generate import generate_demonstrations
+from lab.tasks import DataOptions
+from warmprior.data.hdf5 import open_robomimic, selected_demos
+from warmprior.envs.control_loop import StepLoop
+from warmprior.envs.simulator import make_simulator, task_env_args
+from warmprior.training import Task
+
+SQUARE, ARM = "square", "robot0_"
+OBSERVATION = ["object", f"{ARM}joint_pos", f"{ARM}gripper_qpos"]
+#: Stiffness, the most that robosuite's own limits allow: the arm is at a target within three control steps.
+KP = 300
+
+
+def joint_env_args() -> dict[str, Any]:
+    """Square, whose actions are seven joint positions in radians and the gripper."""
+    env_args = copy.deepcopy(task_env_args(SQUARE))
+    parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
+    parts["right"] = {
+        "type": "JOINT_POSITION",
+        "input_type": "absolute",
+        "input_max": 1,
+        "input_min": -1,
+        "output_max": 0.05,
+        "output_min": -0.05,
+        "kp": KP,
+        "damping_ratio": 1,
+        "impedance_mode": "fixed",
+        "kp_limits": [0, KP],
+        "damping_ratio_limits": [0, 10],
+        "qpos_limits": None,
+        "interpolation": None,
+        "ramp_ratio": 0.2,
+        "gripper": {"type": "GRIP"},
+    }
+    return env_args
+
+
+def followed(path: Path, loop: StepLoop) -> Iterator[Episode]:
+    """Demonstrations of the follower, of those in a file, if they solve the task."""
+    with open_robomimic(path) as file:
+        names = selected_demos(file, None)
+        for index, name in enumerate(tqdm(names, "joint targets", unit="demo")):
+            demo = file[f"data/{name}"]
+            joints = demo[f"next_obs/{ARM}joint_pos"][()]
+            # It holds the last target for as long as it lags behind.
+            targets = np.concatenate([joints, np.repeat(joints[-1:], 10, 0)])
+            fingers = demo["actions"][:, -1:]
+            actions = np.concatenate([targets, np.pad(fingers, ((0, 10), (0, 0)), "edge")], -1)
+            episode = follow(loop, demo["states"][0], actions)
+            if episode.success:
+                episode.seed, episode.operator = index, int(demo.attrs["operator"])
+                yield episode
+
+
+def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
+    """Play targets from a state until the task is solved for six steps."""
+    loop.reset(0)
+    observations, states, rewards = [loop.set_state(state)], [], []
+    for robot in loop.env.robots:
+        robot.composite_controller.reset()
+    for action in actions:
+        states.append(loop.state())
+        observed, success = loop.step(action)
+        observations.append(observed)
+        rewards.append(float(success))
+        if sum(rewards[-6:]) == 6:
+            break
+    return Episode(
+        seed=0,
+        operator=0,
+        level="better",
+        success=any(rewards),
+        actions=actions[: len(rewards)],
+        states=np.stack(states),
+        rewards=np.array(rewards),
+        observations={key: np.stack([each[key] for each in observations]) for key in observations[0]},
+    )
+
+
+def demonstrations(style: str, count: int) -> Path:
+    """The file of the follower's demonstrations, recorded if there is none yet."""
+    source = generate_demonstrations(SQUARE, style, count)
+    path = source.with_name(f"{source.stem}_joint_targets.hdf5")
+    if not path.exists():
+        env = make_simulator(joint_env_args())
+        loop = StepLoop(env, [*OBSERVATION, f"{ARM}eef_pos", f"{ARM}eef_quat"])
+        model = str(env.sim.model.get_xml())
+        write_robomimic(path, followed(source, loop), env_args=joint_env_args(), model_file=model)
+        env.close()
+    return path
+
+
+def task(options: DataOptions) -> Task:
+    """The follower's demonstrations, and square under the same controller."""
+    style = options.data[0]
+    if style not in ("ph", "mh"):
+        raise ValueError(f"--data {style} has no scripted demonstrations: name ph or mh")
+    path = demonstrations(style, options.count(style))
+    return Task.open(path, style=style, observation_keys=OBSERVATION)
+
+
+PLAYED = {"data": {"task": ("joint_targets:task",)}}
+
+
+@script("joint_targets.py", together=True)
+def main(argv: list[str] | None) -> None:
+    presets = {name: with_parts(preset, **PLAYED) for name, preset in PRESETS.items()}
+    run(argv, presets, "joint_targets", __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

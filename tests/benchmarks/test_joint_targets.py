@@ -1,0 +1,45 @@
+"""Demonstrations of a follower arm that gets joint targets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("robosuite")
+
+import h5py
+import joint_targets
+
+from lab.scripted.generate import generate_demonstrations
+from lab.tasks import DataOptions
+from warmprior.data import convert_robomimic
+from warmprior.training import Task
+
+
+def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
+    task = joint_targets.task(DataOptions(demonstrations=(1,)))
+    leader = h5py.File(generate_demonstrations("square", "ph", 1))["data/demo_0"]
+    (path,) = tmp_path.rglob("*joint_targets.hdf5")
+    follower = h5py.File(path)["data/demo_0"]
+    joints, steps = leader["next_obs/robot0_joint_pos"][()], len(follower["actions"])
+    expected = np.concatenate([joints, np.repeat(joints[-1:], 10, 0)])[:steps]
+    np.testing.assert_array_equal(follower["actions"][:, :7], expected)
+    np.testing.assert_allclose(follower["states"][0, 1:], leader["states"][0, 1:], atol=1e-12)
+    # It lags behind by less than the arm moves in three steps.
+    lag = np.abs(follower["next_obs/robot0_joint_pos"][()] - expected)
+    assert 0 < lag.max() < 3 * np.abs(np.diff(expected, axis=0)).max()
+    assert follower["rewards"][-1] == 1
+
+    env = task.make_env()
+    assert task.data["observation"].shape[-1] == 14 + 7 + 2
+    assert task.data["action"].shape[-1] == 8
+    assert env.action_spec.shape == (8,)
+    env.close()
+    assert joint_targets.demonstrations("ph", 1) == path  # recorded once
+
+    pytest.importorskip("lerobot.datasets")
+    folder = convert_robomimic(path, tmp_path / "joints")
+    converted = Task.open(f"lerobot:{folder}", observation_keys=joint_targets.OBSERVATION)
+    torch.testing.assert_close(converted.data["action"], task.data["action"])
