@@ -40,6 +40,6 @@ def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
     assert joint_targets.demonstrations("ph", 1) == path  # recorded once
 
     pytest.importorskip("lerobot.datasets")
-    folder = convert_robomimic(path, tmp_path / "joints")
+    folder = convert_robomimic(path, tmp_path / "joints", observation_keys=joint_targets.OBSERVATION)
     converted = Task.open(f"lerobot:{folder}", observation_keys=joint_targets.OBSERVATION)
     torch.testing.assert_close(converted.data["action"], task.data["action"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -162,6 +164,32 @@ def test_a_mask_that_names_no_episode(converted, tmp_path):
     folder = convert_robomimic(path, tmp_path / "out", demos=1)  # the mask valid is of the second
     with pytest.raises(DatasetError, match=r"out: .*mask .*valid"):
         LeRobotDemonstrations(folder, filter_key="valid")
+
+
+def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
+    """Seven joints, and no gripper, are as wide as a pose delta and the gripper."""
+    path, env_args = tmp_path / "lift.hdf5", env_args_15("lift")
+    parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
+    parts["right"] = {"type": "JOINT_POSITION", "input_type": "absolute", "gripper": {"type": "GRIP"}}
+    write_robomimic_file(path, task="lift", env_args=env_args)
+    seen = ["robot0_gripper_qpos", "object"]
+    converted = convert_robomimic(path, tmp_path / "out", observation_keys=seen)
+    features = json.loads((converted / "meta" / "info.json").read_text())["features"]
+    assert features["action"]["names"] is None
+    theirs = RobomimicDemonstrations(path, observation_keys=seen).data
+    mine = LeRobotDemonstrations(converted, observation_keys=seen).data
+    torch.testing.assert_close(mine["action"], theirs["action"], rtol=0, atol=0)
+    torch.testing.assert_close(mine["observation"], theirs["observation"], rtol=0, atol=0)
+
+
+def test_a_file_without_an_environment_is_not_converted(tmp_path):
+    path = tmp_path / "lift.hdf5"
+    write_robomimic_file(path, task="lift")
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["env_args"]
+    with pytest.raises(DatasetError, match=r"lift\.hdf5.*env_args"):
+        convert_robomimic(path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_converted(tmp_path):

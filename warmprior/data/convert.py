@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +35,7 @@ def convert_robomimic(
     *,
     images: Literal["image", "video"] | None = None,
     demos: int | None = None,
+    observation_keys: Sequence[str] | None = None,
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
@@ -50,11 +51,13 @@ def convert_robomimic(
         images: write those of the file as well, as pictures (``"image"``, lossless PNG) or as videos
             (``"video"``, lossy, smaller).
         demos: how many to convert, the first ones by their numbers; all if ``None``.
+        observation_keys: the observations to write; by default the task's.
 
     Raises:
         FileNotFoundError: if there is no such file.
         FileExistsError: if there is something at ``folder``.
-        DatasetError: if the file is not as it should be, or has no images to write.
+        DatasetError: if the file is not as it should be, does not describe its environment, or has no images
+            to write.
         ValueError: if ``images`` is unknown, or the file's are too small for a video.
         OSError: if the disk is full, or another process converts to the same folder.
 
@@ -68,13 +71,19 @@ def convert_robomimic(
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     path, folder = Path(path), Path(folder).expanduser()
-    index = read_index(path, demos=demos)
+    chosen: dict[str, Any] = {"demos": demos, "observation_keys": observation_keys}
+    index = read_index(path, **chosen)
+    if not index.env_args:
+        raise DatasetError(
+            f"{path} has no data.attrs['env_args'], which say how fast it was recorded (control_freq): record "
+            "such data with LeRobot, or train on the file itself"
+        )
     if images is not None:
         check_choice("images", images, KINDS)
         keys = [f"{camera}_image" for camera in index.cameras]
         if not keys:
             raise DatasetError(f"{path} has no images: render them first, or take images=None")
-        index = read_index(path, demos=demos, image_keys=keys)
+        index = read_index(path, image_keys=keys, **chosen)
         side = index.image_size
         if images == "video" and side < VIDEO_SIZE:
             raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; take images='image'")
@@ -138,6 +147,7 @@ def _write(
     data = RobomimicDemonstrations(
         index.path,
         demos=len(index.demos),
+        observation_keys=index.observation_keys,
         image_keys=index.image_keys,
         storage="memmap" if images else "memory",
         as_recorded=True,
