@@ -75,8 +75,8 @@ def convert_robomimic(
     index = read_index(path, **chosen)
     if not index.env_args:
         raise DatasetError(
-            f"{path} has no data.attrs['env_args'], which say how fast it was recorded (control_freq): record "
-            "such data with LeRobot, or train on the file itself"
+            f"{path} has no data.attrs['env_args'], which say how fast it was recorded (control_freq): write "
+            "them, or train on the file itself"
         )
     if images is not None:
         check_choice("images", images, KINDS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -76,9 +76,8 @@ class Demonstrations:
         """Of Gymnasium, as :func:`warmprior.envs.registered_env` takes it, if they were recorded in one."""
         return minari_environment(self._place) if self._prefix == MINARI else None
 
-    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the contents, as far as these images and that many demonstrations are used."""
-        used: dict[str, Any] = {"image_keys": image_keys, "demos": demos}
+    def digest(self, **used: Any) -> str:
+        """SHA-256 of the contents; of a LeRobotDataset those that the options of :meth:`index` select."""
         if self._prefix == LEROBOT:
             whole = read_lerobot_index(self._place, fetch=True, **self._options, **used).digest()
         elif self._prefix == MINARI:

@@ -249,7 +249,7 @@ class Task:
         recorded = files.recorded_task(
             dataset, images, style=style, observation_steps=observation_steps, actions=actions
         )
-        sha256 = found.digest(image_keys, demos)
+        sha256 = found.digest(observation_keys=observation_keys, image_keys=image_keys, demos=demos)
         # Nothing is said of what is usual.
         space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
         space |= {} if images is None else {"obs": "image", "images": images}
