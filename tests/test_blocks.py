@@ -1,0 +1,99 @@
+"""The programs of the pages run as they stand; what needs something of the reader's says so."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.data.synthetic import write_robomimic_file
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+GIVEN = re.compile(r"# Given: ([\w, ]+); .*\.\n")
+TRAINED = "iterations=1_000"
+"""What only the long programs have, which tests/test_quickstart.py shortens."""
+
+
+def _blocks() -> list[tuple[str, str]]:
+    found = []
+    for page in PAGES:
+        texts = re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.S | re.M)
+        found += [(f"{page.name}-{number}", text) for number, text in enumerate(texts, 1)]
+    return found
+
+
+BLOCKS = _blocks()
+PROGRAMS = [pytest.param(text, id=name) for name, text in BLOCKS if not GIVEN.match(text)]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A folder with the files that the pages name."""
+    (tmp_path / "core").mkdir()
+    write_robomimic_file(tmp_path / "square.hdf5", masks={"train": [0, 1]})
+    write_robomimic_file(tmp_path / "core" / "coffee_d0.hdf5", [3] * 10, task="coffee_d0")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("text", [each for each in PROGRAMS if TRAINED not in each.values[0]])
+def test_a_program_runs(files, text):
+    exec(compile(text, "block", "exec"), {"__name__": "__main__"})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", PROGRAMS)
+def test_a_program_runs_in_a_fresh_process(files, text):
+    subprocess.run([sys.executable, "-c", text], check=True)
+
+
+@pytest.mark.parametrize("text", [pytest.param(text, id=name) for name, text in BLOCKS])
+def test_names_are_defined_or_said_to_be_given(text):
+    check = [
+        sys.executable,
+        "-m",
+        "ruff",
+        "check",
+        "--isolated",
+        "--select=F821",
+        "--output-format=json",
+        "-",
+    ]
+    found = json.loads(subprocess.run(check, input=text, capture_output=True, text=True).stdout)
+    undefined = {re.search("`(.*?)`", each["message"])[1] for each in found}
+    given = GIVEN.match(text)
+    assert undefined == (set(given[1].split(", ")) if given else set())
+
+
+COMMAND = re.compile(r"^(?:torchrun [^\n]*? )?(?:python )?(-m warmprior|benchmarks/\w+\.py)(.*)$", re.M)
+
+
+WITH_SUBCOMMANDS = ("-m warmprior", "benchmarks/demonstrations.py")
+
+
+def _options(command: str, capsys) -> set[str]:
+    """The options that the help of a command lists."""
+    path, *subcommand = command.removeprefix("-m ").split()
+    module = "warmprior.__main__" if path == "warmprior" else Path(path).stem
+    with pytest.raises(SystemExit):
+        importlib.import_module(module).main([*subcommand, "--help"])
+    return set(re.findall(r"(?<![\w-])--[\w.-]*\w", capsys.readouterr().out))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_have_the_options_that_pages_show(page, capsys):
+    known: dict[str, set[str]] = {}
+    for block in re.findall(r"^```console\n(.*?)^```$", page.read_text(), re.S | re.M):
+        for command, rest in COMMAND.findall(block.replace("\\\n", " ")):
+            words = rest.split("#")[0].split()
+            if command in WITH_SUBCOMMANDS:
+                command = f"{command} {words[0]}"
+            if command not in known:
+                known[command] = _options(command, capsys)
+            options = {word.split("=")[0] for word in words if word.startswith("--")}
+            assert options <= known[command], f"{page.name}: {command}{rest}"
