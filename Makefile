@@ -9,20 +9,29 @@ PLUGIN := plugins/lerobot_policy_warmprior
 GROOT := .venv-groot
 GROOT_NEEDS := tests/lerobot/groot_n15.txt
 
+CHECK_PYTHON := $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
+	{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
+
 .PHONY: install benchmark throughput test test-slow test-groot-n15 latest lint fuzz results docs clean
 
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt $(PLUGIN)/pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
-		{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	$(BIN)/python -m pip install --quiet --no-deps --editable $(PLUGIN)
 	@touch $@
 
-benchmark: install
+# The benchmark alone needs a fraction of the packages, and nothing compiled beforehand.
+.venv/simulator: pyproject.toml constraints.txt
+	@$(CHECK_PYTHON)
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[sim]"
+	@touch $@
+
+benchmark: $(if $(wildcard .venv/installed),install,.venv/simulator)
 	$(BIN)/python benchmarks/robomimic.py $(ARGS)
 
 throughput: install

@@ -1,6 +1,6 @@
 """The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks.
 
-python benchmarks/robomimic.py                                   # a first table within 15 minutes
+python benchmarks/robomimic.py                                   # a first table within minutes
 python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
 python benchmarks/robomimic.py --obs image                       # lift from two cameras
 python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper

@@ -233,9 +233,9 @@ def check_single(options: Options, *names: str) -> None:
 
 
 PRESETS: dict[str, Options] = {
-    # One seed, small network: a first table within 15 minutes on two cores.
-    "quick": Options(data=DataOptions(demonstrations=(GENERATED,))),
-    # The same policies with three seeds and twice the episodes: a table with seeds.
+    # One seed, a small network and a short training: a first table within five minutes on two cores.
+    "quick": Options(data=DataOptions(demonstrations=(100,)), training=TrainingConfig(iterations=5_000)),
+    # Twice the training and the episodes, three seeds.
     "cpu": Options(data=DataOptions(demonstrations=(150, 300)), evaluation=Evaluation(seeds=3, episodes=50)),
     # The paper's: 20M parameters, 200k iterations.
     "paper": Options(

@@ -139,7 +139,7 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
     """A preset generates as many as it likes; a file is taken whole unless its user says otherwise."""
     file = tmp_path / "file.hdf5"
     file.touch()
-    for name, (ph, mh) in {"quick": (150, 150), "cpu": (150, 300), "paper": (200, 300)}.items():
+    for name, (ph, mh) in {"quick": (100, 100), "cpu": (150, 300), "paper": (200, 300)}.items():
         data = read("--preset", name).data
         assert (data.count("ph"), data.count("mh")) == (ph, mh)
         for argv in (["--dataset", file], ["--download"]):
