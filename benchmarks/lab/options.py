@@ -26,7 +26,6 @@ from lab.files import ERRORS
 from lab.machine import check_device, facts_of_machine
 from lab.methods import Method
 from lab.tasks import (
-    GENERATED,
     DataOptions,
     check_counts,
     check_network,

@@ -15,7 +15,7 @@ from warmprior import (
     PastPrior,
     PoseTrend,
     PreconditionedNetwork,
-    RestingAction,
+    RestingPose,
     SourceMoments,
     VelocityMLP,
     VelocityNetwork,
@@ -63,11 +63,11 @@ def test_the_resting_action_is_that_of_no_delta(sign):
     raw[:, 5:] *= sign  # both quaternions of a rotation
     expected = absolute_actions(torch.zeros(30, 7), raw[:, 1:4], raw[:, 5:])
     data = units.normalize(TensorDict({"observation": raw, "action": expected}, [30]))
-    found = RestingAction(COLUMNS, units)(data["observation"])
+    found = RestingPose(COLUMNS, units)(data["observation"])
     torch.testing.assert_close(found[:, :9], data["action"][:, :9], rtol=0, atol=1e-5)
     assert (found[:, 9] == 0).all()
     wider = torch.cat([data["observation"], torch.full((30, 4), math.nan)], -1)
-    torch.testing.assert_close(RestingAction(COLUMNS, units)(wider), found)
+    torch.testing.assert_close(RestingPose(COLUMNS, units)(wider), found)
 
 
 def windows(n=4000, noise=0.1, warm=False):
@@ -75,7 +75,7 @@ def windows(n=4000, noise=0.1, warm=False):
     rng = np.random.default_rng(0)
     raw = torch.stack([observations(n, 1), observations(n, 2)], 1)
     slopes = torch.from_numpy(rng.uniform(0.5, 1.5, (P, D_A))).float()
-    resting = RestingAction(COLUMNS)(raw[:, -1])
+    resting = RestingPose(COLUMNS)(raw[:, -1])
     target = 1 + resting[:, None] * slopes
     target = target + noise * torch.from_numpy(rng.normal(size=(n, P, D_A))).float()
     pad = torch.from_numpy(rng.random((n, P)).cumsum(1) > 1.8)
@@ -93,13 +93,13 @@ def windows(n=4000, noise=0.1, warm=False):
 
 def fit(batch, prior):
     generator = torch.Generator().manual_seed(0)
-    return PoseTrend.fit(batch, prior, RestingAction(COLUMNS), generator=generator)
+    return PoseTrend.fit(batch, prior, RestingPose(COLUMNS), generator=generator)
 
 
 def test_against_least_squares():
     batch = windows()
     trend = fit(batch, GaussianPrior(P))
-    resting = RestingAction(COLUMNS)(batch["observation"][:, -1]).double().numpy()
+    resting = RestingPose(COLUMNS)(batch["observation"][:, -1]).double().numpy()
     for position in range(P):
         kept = ~batch["action_is_pad"][:, position].numpy()
         goal = batch["vla_action", "chunk"][:, position].double().numpy()[kept]
@@ -121,7 +121,7 @@ def test_preconditioning_leaves_the_remainder(prior):
     moments = SourceMoments.fit(batch, prior, trend=trend, generator=generator)
     a0 = prior.sample(batch["history"], generator=generator)
     a1, observation = batch["vla_action", "chunk"], batch["observation"]
-    resting = RestingAction(COLUMNS)(observation[:, -1]).numpy()
+    resting = RestingPose(COLUMNS)(observation[:, -1]).numpy()
     network = PreconditionedNetwork(Nothing(), moments=moments, trend=trend)
     kept = ~batch["action_is_pad"][:, 0].numpy()
     for time in (0.0, 0.5):
@@ -137,7 +137,7 @@ def test_preconditioning_leaves_the_remainder(prior):
 
 def test_config_and_state_bring_it_back():
     batch, prior = windows(200), GaussianPrior(P)
-    trend = PoseTrend.fit(batch, prior, RestingAction(COLUMNS, normalizer()))
+    trend = PoseTrend.fit(batch, prior, RestingPose(COLUMNS, normalizer()))
     moments = SourceMoments.fit(batch, prior, trend=trend)
     mlp = VelocityMLP(D_A, D_O, P, TO, hidden_dim=8)
     network = PreconditionedNetwork(mlp, moments=moments, trend=trend)

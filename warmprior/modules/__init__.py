@@ -7,7 +7,14 @@ from warmprior.modules.mlp import PlainMLP, VelocityMLP
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, Sampling, integrate
-from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
+from warmprior.modules.preconditioning import (
+    PoseTrend,
+    PreconditionedNetwork,
+    RestingAction,
+    RestingJoints,
+    RestingPose,
+    SourceMoments,
+)
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.transformers import AdaLNTransformer, ChiTransformer
@@ -30,6 +37,8 @@ __all__ = [
     "PriorSampler",
     "RealTimeChunking",
     "RestingAction",
+    "RestingJoints",
+    "RestingPose",
     "Sampling",
     "Source",
     "SourceMoments",

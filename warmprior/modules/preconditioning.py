@@ -33,21 +33,23 @@ _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, 
 
 
 class RestingAction(nn.Module):
-    """The absolute action that asks every gripper to stay where the observation says it is.
+    """The absolute action that asks a robot to stay where the observation says it is.
+
+    Subclasses say which numbers of the observation are the position of what: :class:`RestingJoints` and
+    :class:`RestingPose`. Called with normalised observations ``[*B, d_o]`` they return normalised actions
+    ``[*B, d_a]``, 0 where an action is no target.
 
     Args:
-        columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
-            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
-        normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default, to
-            be replaced by loading a state dict.
+        columns: int64, which numbers of the observation.
+        action_shape: of the actions, ``d_a`` in all.
+        normalizer: of the observations ``[d_o]`` and the actions ``[d_a]``; an identity by default, to be
+            replaced by loading a state dict.
 
     Examples:
         >>> import torch
-        >>> from warmprior import RestingAction
-        >>> rest = RestingAction(torch.arange(7)[None])
-        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
-        >>> rest(observation).tolist()[:3], rest(observation).shape
-        ([0.1..., 0.2..., 0.3...], torch.Size([10]))
+        >>> from warmprior import RestingAction, RestingJoints, RestingPose
+        >>> [issubclass(kind, RestingAction) for kind in (RestingJoints, RestingPose)]
+        [True, True]
     """
 
     columns: Tensor
@@ -57,16 +59,15 @@ class RestingAction(nn.Module):
     action_scale: Tensor
     positive = ("scale", "action_scale")
 
-    def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
+    def __init__(self, columns: Tensor, action_shape: tuple[int, ...], normalizer: Normalizer | None) -> None:
         super().__init__()
-        if columns.ndim != 2 or columns.shape[1] != _POSE:
-            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
-        shapes = columns.shape, (len(columns), _ABSOLUTE)
-        affine = [make(shape) for shape in shapes for make in (torch.zeros, torch.ones)]
+        affine = [
+            make(shape) for shape in (columns.shape, action_shape) for make in (torch.zeros, torch.ones)
+        ]
         if normalizer is not None:
             ends = normalizer.loc, normalizer.scale
             affine = [end(keys.OBSERVATION)[columns] for end in ends]
-            affine += [end(keys.ACTION).unflatten(0, (-1, _ABSOLUTE)) for end in ends]
+            affine += [end(keys.ACTION).reshape(action_shape) for end in ends]
         self.register_buffer("columns", columns)
         for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
             self.register_buffer(name, value.clone())
@@ -76,8 +77,45 @@ class RestingAction(nn.Module):
         """``d_a``."""
         return self.action_loc.numel()
 
+    @staticmethod
+    def zero(kind: str, count: int) -> RestingAction:
+        """One of a kind, to be replaced by loading a state dict."""
+        made: dict[str, tuple[type[RestingPose | RestingJoints], tuple[int, ...]]] = {
+            "pose": (RestingPose, (count, _POSE)),
+            "joints": (RestingJoints, (count,)),
+        }
+        kinds, shape = made[kind]
+        return kinds(torch.zeros(shape, dtype=torch.int64))
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable arguments of :meth:`zero`."""
+        return {"kind": "pose" if isinstance(self, RestingPose) else "joints", "count": len(self.columns)}
+
+
+class RestingPose(RestingAction):
+    """The absolute pose at which every gripper stays where the observation says it is.
+
+    Args:
+        columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
+            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
+        normalizer: see :class:`RestingAction`; of actions ``[10 * arms]``, the grippers' 0.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingPose
+        >>> rest = RestingPose(torch.arange(7)[None])
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+        >>> rest(observation).tolist()[:3], rest(observation).shape
+        ([0.1..., 0.2..., 0.3...], torch.Size([10]))
+    """
+
+    def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
+        if columns.ndim != 2 or columns.shape[1] != _POSE:
+            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
+        super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
+
     def forward(self, observation: Tensor) -> Tensor:
-        """The action, ``[*B, 10 * arms]``, 0 for the gripper, at ``[*B, d_o]``; both normalised."""
+        """The action ``[*B, 10 * arms]``."""
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
         site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
@@ -86,12 +124,40 @@ class RestingAction(nn.Module):
         return pad(normalised, (0, 1)).flatten(-2)
 
 
+class RestingJoints(RestingAction):
+    """The joint targets at which every joint stays where the observation says it is.
+
+    Args:
+        columns: int64 ``[d_a]``, where in the observation the position is that an action is the target of, in
+            the same units; -1 for an action that is no target.
+        normalizer: see :class:`RestingAction`.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingJoints
+        >>> rest = RestingJoints(torch.tensor([1, 2, -1]))  # two joints and a gripper's command
+        >>> rest(torch.tensor([9.0, 0.5, -0.25])).tolist()
+        [0.5, -0.25, 0.0]
+    """
+
+    def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
+        if columns.ndim != 1:
+            raise ValueError(f"columns must be [d_a], got {list(columns.shape)}")
+        super().__init__(columns, (len(columns),), normalizer)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The action ``[*B, d_a]``."""
+        joints = observation[..., self.columns] * self.scale + self.loc
+        return torch.where(self.columns >= 0, (joints - self.action_loc) / self.action_scale, 0.0)
+
+
 class PoseTrend(nn.Module):
     """Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
 
-    Absolute poses lie near the present pose, which explains most of their variance. A network without a trend
-    spends its precision on that, and passes on source noise that is many times as large as the change of a
-    pose in one step. With a trend, :class:`PreconditionedNetwork` learns the remainder: where to go from
+    Absolute poses and joint targets lie near the present ones, which explain most of their variance. A
+    network without a trend spends its precision on that, and passes on source noise that is many times as
+    large as the change in one step. With a trend, :class:`PreconditionedNetwork` learns the remainder: where
+    to go from
     here, as with deltas. Every action dimension is predicted from the same dimension of the resting action at
     the last observation: a regression on the whole observation fits better, but fails away from the
     demonstrations.
@@ -107,8 +173,8 @@ class PoseTrend(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from warmprior import PoseTrend, RestingAction
-        >>> rest = RestingAction(torch.arange(7)[None])
+        >>> from warmprior import PoseTrend, RestingPose
+        >>> rest = RestingPose(torch.arange(7)[None])
         >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
         >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
         >>> source, target = trend(observation)  # the targets follow the gripper, the source does not
@@ -135,11 +201,11 @@ class PoseTrend(nn.Module):
             self.register_buffer(name, value.clone())
 
     @classmethod
-    def zero(cls, arms: int, prediction_length: int) -> PoseTrend:
+    def zero(cls, rest: dict[str, Any], prediction_length: int) -> PoseTrend:
         """No trend, to be replaced by loading a state dict."""
-        rest = RestingAction(torch.zeros(arms, _POSE, dtype=torch.int64))
-        none = torch.zeros(prediction_length, _ABSOLUTE * arms)
-        return cls(rest, none[0], none, none)
+        made = RestingAction.zero(**rest)
+        none = torch.zeros(prediction_length, made.width)
+        return cls(made, none[0], none, none)
 
     @classmethod
     @torch.no_grad()
@@ -171,7 +237,7 @@ class PoseTrend(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable arguments of :meth:`zero`; the values themselves are buffers."""
-        return {"arms": len(self.rest.columns), "prediction_length": len(self.source)}
+        return {"rest": self.rest.config(), "prediction_length": len(self.source)}
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.

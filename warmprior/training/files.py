@@ -14,7 +14,7 @@ from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 from warmprior.keys import ACTION, OBSERVATION, STATE
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.preconditioning import RestingAction
+from warmprior.modules.preconditioning import RestingPose
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
 
@@ -62,7 +62,7 @@ def recorded_task(
         "make_env": make_env,
         "normalizer": normalizer,
         "adapters": adapters,
-        "rest": None if absolute is None else RestingAction(dataset.pose_columns, normalizer),
+        "rest": None if absolute is None else RestingPose(dataset.pose_columns, normalizer),
         # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
         "clip": 1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
         "environment": description,
