@@ -64,7 +64,7 @@ def compare(
             for checkpoint, nfe, temperature, condition in product(
                 policy.training.checkpoint_iterations,
                 policy.method.nfes(evaluation.nfe),
-                evaluation.temperature,
+                policy.method.temperatures(evaluation.temperature),
                 conditions(policy.method),
             )
         ]

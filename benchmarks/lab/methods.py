@@ -16,7 +16,7 @@ from __future__ import annotations
 import inspect
 import json
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,9 @@ import torch
 
 from lab.bridge import BridgeCoupling
 from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorActor
+from lab.mip import SECOND, MIPCoupling
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
+from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of
 from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
@@ -44,6 +46,46 @@ class ColdPrior(GaussianPrior):
     def __init__(self, chunk_length: int, chunks: int) -> None:
         super().__init__(chunk_length)
         self.chunks = self.prediction_chunks = chunks
+
+
+class TwoChunkPrior(ColdPrior):
+    """N(0, I) for a policy that forecasts the next chunk as well."""
+
+    name = "two-chunks"
+
+    def __init__(self, chunk_length: int) -> None:
+        super().__init__(chunk_length, 2)
+
+
+class WarmStart(StartPoint):
+    r"""A warm start without training: the flow of N(0, I) is entered on the way, from the last forecast.
+
+    .. math:: a_s = (1 - s) \varepsilon + s f,
+
+    where :math:`f` is what the policy forecast last, as it is known, and held at its last action after that
+    (One-Step Flow Policy, Li et al., 2026, arXiv:2603.12480). An episode begins with a forecast of 0.
+    """
+
+    name = "warm-start"
+    sees_history = False  # in training, where it has no part
+
+    def __init__(self, chunk_length: int, start_time: float = 0.5) -> None:
+        super().__init__()
+        check_finite_numbers(start_time=start_time)
+        if not 0.0 < start_time < 1.0:
+            raise ValueError(f"need 0 < start_time < 1, got {start_time}")
+        self.chunk_length = chunk_length
+        self.start_time = self.time = start_time
+        self.noise_share = 1.0 - start_time
+
+    def centre(self, history: Any, observation: Any) -> torch.Tensor:
+        forecast, steps = history["forecast"], history["forecast_steps"]
+        position = torch.arange(forecast.shape[-2], device=steps.device)
+        known = torch.minimum(position, (steps - 1).clamp_min(0)).unsqueeze(-1)
+        return self.time * forecast.gather(-2, known.expand_as(forecast))
+
+    def forward(self, noise: torch.Tensor, history: Any, observation: Any) -> torch.Tensor:
+        return self.centre(history, observation) + self.noise_share * noise
 
 
 class PointPrior(GaussianPrior):
@@ -82,7 +124,7 @@ class Composition:
     coupling: Callable[..., Coupling] | None = None  # of sources and targets, if not as they come
     teacher: str | None = None  # the method whose policy the coupling needs
     sees_history: bool = False  # the network sees the last actions
-    regresses: bool = False  # the field is trained at t = 0 alone, for one network evaluation
+    played: Mapping[str, Any] = field(default_factory=dict)  # options of `Sampling`, where it is no flow
 
 
 METHODS: dict[str, Composition] = {
@@ -91,7 +133,14 @@ METHODS: dict[str, Composition] = {
     "preview": Composition("WP-Preview", "#d95f02", PreviewPrior),
     "forecast": Composition("WP-Forecast", "#d62728", ForecastPrior),
     "history": Composition("History", "#6a51a3", sees_history=True),
-    "regression": Composition("Regression", "#b8860b", PointPrior, regresses=True),
+    "regression": Composition("Regression", "#b8860b", PointPrior, played={"nfe": 1}),
+    "mip": Composition(
+        "MIP",
+        "#393b79",
+        coupling=MIPCoupling,
+        played={"nfe": 2, "grid": f"dense-jump:{SECOND}", "temperature": 0.0},
+    ),
+    "warm-start": Composition("Warm start", "#e6550d", TwoChunkPrior, start=WarmStart),
     "ot": Composition("OT-CFM", "#2ca02c", coupling=OTCoupling),
     "bridge": Composition("SB-CFM", "#98df8a", coupling=bridge),
     "reflow": Composition("2-rectified flow", "#17becf", coupling=reflow, teacher="gaussian"),
@@ -225,8 +274,8 @@ class Method:
 
     @property
     def is_flow(self) -> bool:
-        """Whether the field is trained at all times, so that it may be integrated in several steps."""
-        return not self.parts.regresses
+        """Whether the field is trained at all times, so that it may be integrated in any number of steps."""
+        return not self.parts.played
 
     @property
     def is_straight(self) -> bool:
@@ -262,15 +311,16 @@ class Method:
         return None if name is None else Method(name, self.chunk_length)
 
     def nfes(self, asked: Sequence[int]) -> list[int]:
-        """Those numbers of network evaluations for which its field means anything, the largest first."""
-        allowed = [nfe for nfe in sorted(set(asked), reverse=True) if self.is_flow or nfe == 1]
-        if not allowed:
-            raise ValueError(f"--prior {self.text} is trained for --nfe 1 alone: add 1, or leave it out")
-        return allowed
+        """How many network evaluations it is played with, the largest first; its own if no flow."""
+        return sorted(set(asked), reverse=True) if self.is_flow else [self.parts.played["nfe"]]
+
+    def temperatures(self, asked: Sequence[float]) -> Sequence[float]:
+        """The factors of the source's noise that it is played with."""
+        return [self.parts.played["temperature"]] if "temperature" in self.parts.played else asked
 
     def recipe(self, training: TrainingConfig) -> TrainingConfig:
         """The recipe for this method: a regression has t = 0 alone, and no history is withheld in vain."""
-        own: dict[str, Any] = {} if self.is_flow else {"times": "start"}
+        own: dict[str, Any] = {"times": "start"} if self.parts.prior is PointPrior else {}
         return replace(training, **own | ({} if self.remembers else {"cold_probability": 0.0}))
 
     def prior(self, widths: Sequence[int] = ()) -> Prior:

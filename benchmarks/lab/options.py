@@ -184,10 +184,11 @@ class Options:
         if self.training.weighting == "standardised" and not self.network.precondition:
             raise ValueError("--no-precondition needs --weighting velocity")
         for method in self.sources.methods():
-            method.nfes(self.evaluation.nfe)
             if method.is_flow and self.training.times == "start":
                 raise ValueError(f"--times start trains no flow: leave out {method.name}, or take regression")
             l1, distilled = self.training.objective == "l1", self.training.self_distillation > 0
+            if distilled and not method.is_flow:
+                raise ValueError(f"--self-distillation needs a flow: leave out {method.name}")
             if (l1 or distilled) and not method.is_straight:
                 asked = "--objective l1" if l1 else "--self-distillation"
                 raise ValueError(f"{asked} needs a straight path: leave out {method.name}")

@@ -41,7 +41,9 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         losses: dict[str, list[list[tuple[int, float]]]] = {}
         for policy in played:
             losses.setdefault(label[policy.name], []).append(policy.losses)
-        fewest = mine[(mine.nfe == min(mine.nfe)) & (mine.temperature == max(mine.temperature))]
+        each = mine.groupby("method")  # of every method, which may have an NFE of its own
+        fewest = mine[mine.nfe == each.nfe.transform("min")]
+        fewest = fewest[fewest.temperature == fewest.groupby("method").temperature.transform("max")]
         plot_learning_curves(losses, fewest, out / f"learning_curves{end}.png", title=title)
         task = played[0].task()
         if not options.run.films:

@@ -95,7 +95,7 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """The policy of averaged weights, on the CPU, as it is played here."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
-        return load_policy(path).replace(grid=self.grid)
+        return load_policy(path).replace(**{"grid": self.grid, **self.method.parts.played})
 
     @property
     def losses(self) -> list[tuple[int, float]]:
@@ -250,7 +250,7 @@ def train(policy: Policy) -> None:
             start=start,
             coupling=method.coupling(teacher.load().to(device) if teacher else None),
             see_history=method.parts.sees_history,
-            max_nfe=None if method.is_flow else 1,
+            max_nfe=method.parts.played.get("nfe"),
             device=device,
             compile=policy.run.compile,
             logger=logger,

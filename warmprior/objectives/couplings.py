@@ -20,7 +20,7 @@ Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tens
 
 The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. A coupling may
 have ``config()``, what it depends on, so that a training knows whether it may be continued, and an
-``interpolant``, a path of its own, which the loss takes.
+``interpolant`` and ``times``, a path and training times of its own, which the loss takes.
 """
 
 

@@ -121,7 +121,8 @@ class FlowMatchingLoss(LossModule):
         # A functional copy of the network would turn Ctrl-C into another error, and exclude DDP.
         self.actor_network = actor_network
         self.coupling, self.objective, self.reduction = coupling, objective, reduction
-        self.times = times if callable(times) else chosen_times(times)
+        own = getattr(coupling, "times", None)  # a coupling may come with times, and a path, of its own
+        self.times = own or (times if callable(times) else chosen_times(times))
         if times == "start" and (sampling.max_nfe != 1 or actor_network.ode.start_time > 0):
             raise ValueError(
                 "times = 'start' trains the field at t = 0 alone: build the policy with max_nfe=1, and "
@@ -133,7 +134,6 @@ class FlowMatchingLoss(LossModule):
         if self.weighting == "standardised" and not standardises:
             raise ValueError("the weighting 'standardised' needs a PreconditionedNetwork, or take 'velocity'")
         built_for = getattr(network, "interpolant", None)
-        # A coupling may come with a path of its own.
         self.interpolant = interpolant or getattr(coupling, "interpolant", built_for) or LinearInterpolant()
         if built_for is not None and built_for.config() != self.interpolant.config():
             raise ValueError(

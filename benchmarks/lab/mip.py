@@ -1,0 +1,59 @@
+"""MIP: two supervised steps, from the point 0 and from nearly the action, in the parts of a flow."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from warmprior import LinearInterpolant
+
+SECOND = 0.9
+"""Time of the second step."""
+
+
+class MIPInterpolant(LinearInterpolant):
+    """The straight line, but for ``t = 0``, where the point is 0 and not a draw of the source.
+
+    Examples:
+        >>> import torch
+        >>> from lab.mip import MIPInterpolant
+        >>> a0, a1, t = torch.ones(2, 1, 1), torch.full((2, 1, 1), 3.0), torch.tensor([0.0, 0.9])
+        >>> [end.flatten().tolist() for end in MIPInterpolant()(a0, a1, t)]
+        [[0.0, 2.8...], [3.0, 2.0]]
+    """
+
+    name = "mip"
+
+    def __call__(
+        self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Point on the path and its velocity."""
+        return super().__call__(torch.where(t[..., None, None] > 0, a0, 0.0), a1, t)
+
+
+class MIPCoupling:
+    r"""Minimal Iterative Policy (Pan et al., 2025, arXiv:2512.01809): pairs as they come, at two times.
+
+    The network predicts the action from the point 0 at :math:`t = 0`, and again from :math:`0.9 a + 0.1
+    \varepsilon` at :math:`t = 0.9`. With :math:`f = a_t + (1 - t) v` both are velocities on
+    :class:`MIPInterpolant`, and the policy is Euler's method from 0 to 0.9 to 1. Where the network is
+    preconditioned, both errors count in units of what a linear prediction leaves.
+    """
+
+    interpolant: ClassVar[MIPInterpolant] = MIPInterpolant()
+
+    def config(self) -> dict[str, Any]:
+        """Its name: it has no options."""
+        return {"name": "mip"}
+
+    def times(
+        self, shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+    ) -> Tensor:
+        """Draw the two times alike often."""
+        second = torch.rand(shape, generator=generator, dtype=dtype, device=device) < 0.5
+        return torch.where(second, SECOND, 0.0).to(dtype)
+
+    def __call__(self, a0: Tensor, a1: Tensor, observation: Any = None) -> tuple[Tensor, Tensor]:
+        return a0, a1

@@ -1,0 +1,103 @@
+"""Rivals that are composed of the library's parts, against their papers' algorithms by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from lab.methods import Method
+from warmprior import FlowMatchingLoss, VelocityMLP, WarmPriorActor, keys
+from warmprior.history import advance, cold_history
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+
+H = 4
+
+
+def network(prediction_length: int) -> VelocityMLP:
+    torch.manual_seed(0)
+    made = VelocityMLP(2, 3, prediction_length, observation_steps=1, hidden_dim=16)
+    for parameter in made.parameters():  # the last layer begins at zero
+        torch.nn.init.normal_(parameter, std=0.3)
+    return made
+
+
+def predicted(field: VelocityMLP, t: float, point: torch.Tensor, observation: torch.Tensor) -> torch.Tensor:
+    """The action that a velocity field says: f = a_t + (1 - t) v."""
+    return point + (1 - t) * field(torch.full((len(point),), t), point, observation)
+
+
+def test_mip_is_two_supervised_steps():
+    """f(0, t = 0) and f(0.9 a + 0.1 eps, t = 0.9), both regressed on the action."""
+    method = Method("mip", H)
+    field, prior = network(H), method.prior()
+    actor = WarmPriorActor(field, prior, max_nfe=2)
+    loss = FlowMatchingLoss(actor, coupling=method.coupling(), reduction="none")
+    loss.generator = torch.Generator().manual_seed(5)
+    history = cold_history([64], H, H, 2)
+    action, observation = torch.randn(64, H, 2), torch.randn(64, 1, 3)
+    windows = {keys.CHUNK: action, keys.HISTORY: history, keys.OBSERVATION: observation}
+    found = loss(TensorDict(windows, [64]))["loss_flow_matching"]
+
+    same = torch.Generator().manual_seed(5)
+    noise = prior.sample(history, observation, same)
+    second = torch.rand(64, generator=same) < 0.5
+    assert 0 < second.sum() < 64
+    first = predicted(field, 0.0, torch.zeros_like(action), observation) - action
+    again = predicted(field, 0.9, 0.9 * action + 0.1 * noise, observation) - action
+    # Of a velocity, an error is that of the action over 1 - t.
+    expected = torch.where(second[:, None, None], again / 0.1, first).square()
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_mip_is_played_as_its_paper_says():
+    method = Method("mip", H)
+    field = network(H)
+    assert method.nfes((9, 1)) == [2] and method.temperatures((1.0, 0.5)) == [0.0]
+    actor = WarmPriorActor(field, method.prior(), **method.parts.played)
+    observation = torch.randn(5, 1, 3)
+    data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: cold_history([5], H, H, 2)}, [5])
+    begun = predicted(field, 0.0, torch.zeros(5, H, 2), observation)
+    expected = predicted(field, 0.9, 0.9 * begun, observation)
+    torch.testing.assert_close(actor(data)[keys.CHUNK], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_warm_start_enters_the_flow_at_the_forecast():
+    """(1 - s) eps + s f, where f is known and held after that."""
+    method = Method("warm-start,start_time=0.25", H)
+    start, prior = method.start(), method.prior()
+    assert prior.prediction_length == 2 * H
+    plan = torch.randn(3, 2 * H, 2)
+    history = advance(cold_history([3], H, 2 * H, 2), plan, torch.full((3, 1), H))
+    noise = torch.randn(3, 2 * H, 2)
+    known = torch.cat([plan[:, H:], plan[:, -1:].expand(3, H, 2)], 1)
+    torch.testing.assert_close(start(noise, history, None), 0.75 * noise + 0.25 * known)
+    cold = start(noise, cold_history([3], H, 2 * H, 2), None)
+    torch.testing.assert_close(cold, 0.75 * noise)
+    with pytest.raises(ValueError, match="start_time"):
+        Method("warm-start,start_time=1", H)
+
+
+@pytest.mark.parametrize("precondition", [True, False])
+def test_mip_learns(precondition):
+    """Preconditioned or not, two steps find an action that the observation says."""
+    torch.manual_seed(0)
+    method = Method("mip", H)
+    observation = torch.rand(400, 1) * 2 - 1
+    steps = {"observation": observation, "action": observation.sin(), "episode": torch.arange(400) // 100}
+    data = TensorDict({**steps}, [400])
+    actor = train_policy(
+        data,
+        method.prior(),
+        network=NetworkOptions(hidden_dim=32, observation_steps=1, precondition=precondition),
+        training=TrainingConfig(iterations=800, weighting=None if precondition else "velocity"),
+        coupling=method.coupling(),
+        max_nfe=2,
+        description=None,
+    ).replace(**method.parts.played)
+    seen = torch.tensor([[-0.8], [0.0], [0.8]])
+    units = actor.normalizer
+    normalised = units.normalize(TensorDict({"observation": seen}, [3]))["observation"].unsqueeze(1)
+    chunk = actor(TensorDict({keys.OBSERVATION: normalised, keys.HISTORY: cold_history([3], H, H, 1)}, [3]))
+    first = units.denormalize(TensorDict({"action": chunk[keys.CHUNK][:, 0]}, [3]))["action"]
+    torch.testing.assert_close(first, seen.sin(), atol=0.1, rtol=0)  # later ones are of other observations
