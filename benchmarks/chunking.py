@@ -13,6 +13,7 @@ import sys
 
 from lab.comparison import compare
 from lab.options import PRESETS, check_single, parse, script, started, with_parts
+from lab.paper import PAPER_CHUNK
 from lab.plots import plot_bars, plot_lines, plot_success
 from lab.policies import policies_of, slug
 from lab.report import labelled, per_seed, table, write_report
@@ -40,7 +41,7 @@ def main(argv: list[str] | None) -> None:
         # All tasks beside each other, at the fewest network evaluations.
         fewest, shortest = seeds[seeds.nfe == min(seeds.nfe)], min(seeds.chunk)
         title = f"NFE {min(seeds.nfe)}, {options.evaluation.seeds} seed(s)"
-        pair = fewest[fewest.chunk.isin((shortest, 8))]
+        pair = fewest[fewest.chunk.isin((shortest, PAPER_CHUNK))]
         bars = {"success": "success rate"}
         plot_bars(pair.assign(chunk="H = " + pair.chunk.astype(str)), out / "bars.png", title, "chunk", bars)
         short = fewest[fewest.chunk == shortest]

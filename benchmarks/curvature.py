@@ -14,10 +14,10 @@ import torch
 from lab.comparison import train_all
 from lab.measures import RATIOS, held_out, straightness
 from lab.options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
-from lab.paper import PAPER_CURVATURE
+from lab.paper import paper_curvature
 from lab.plots import plot_flow_paths
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
-from lab.report import labelled, pooled, problem_title, table, text_of, write_report
+from lab.report import labelled, pooled, problem_title, table, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
 
 
@@ -62,7 +62,7 @@ def main(argv: list[str] | None) -> None:
                 generator = torch.Generator(options.run.device).manual_seed(0)
                 windows = few.windows(actor.prior, see_history=actor.sees_history)
                 windows = encoded_windows(actor, windows)
-                path = flow_paths(actor, windows, 100, generator=generator)
+                path = flow_paths(actor, windows, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, 0].cpu()
         title = f"{task['task']} {task['data']}: action coordinate 0 along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
@@ -75,9 +75,10 @@ def main(argv: list[str] | None) -> None:
             "does not.",
         ]
         chosen = labelled(pooled(rows))
-        if chosen.prior.iloc[0] == "gaussian" and chosen.chunk.iloc[0] == 8 and not text_of(task, "obs"):
-            known = PAPER_CURVATURE.get((task["task"], task["data"]), {})
-            chosen = chosen.assign(paper_ratio=chosen.prior.map(known))
+        if chosen.prior.iloc[0] == "gaussian":  # to which the ratios are
+            chosen = chosen.assign(
+                paper_ratio=[paper_curvature(task | row) for row in chosen.to_dict("records")]
+            )
         text = table(chosen, ["mean", "method"], [*RATIOS, "paper_ratio"], notes)
         write_report(out, text, text, rows)
 

@@ -136,7 +136,7 @@ def main(argv: list[str] | None) -> None:
                 index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
                 batch = window[index : index + 1].expand(48).contiguous()
                 generator = torch.Generator().manual_seed(seed)
-                paths[row.method] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
+                paths[row.method] = flow_paths(actor, batch, generator=generator)[..., 0, 0]
         network, iterations = options.network.hidden_dim, options.training.iterations
         what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
         title = f"One-dimensional navigation: {what}"

@@ -71,7 +71,7 @@ def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float 
     if policy.sampling.max_nfe is None:
         with warnings.catch_warnings():  # the NaN says that something does not move
             warnings.simplefilter("ignore")
-            values = curvature(policy, met, 100, generator=generator)
+            values = curvature(policy, met, generator=generator)
         kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
     flow = {
         "kappa": kappa,
@@ -166,7 +166,6 @@ def straightness(
     policies: Mapping[Method, Mapping[int, WarmPriorActor]],
     observations: SharedObservations,
     *,
-    n_steps: int = 100,
     draws: int = 1,
     seed: int = 0,
 ) -> list[dict[str, Any]]:
@@ -195,7 +194,7 @@ def straightness(
             # The same source noise for every policy and mean.
             generator = torch.Generator(device).manual_seed(seed)
             try:
-                values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+                values = curvature(actor, batch, draws=draws, generator=generator).cpu()
             except FloatingPointError as error:
                 raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
             limits = bounds(actor.prior, batch, method.parts.coupling is not None)

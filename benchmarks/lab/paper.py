@@ -49,8 +49,18 @@ PAPER_SIGMA: dict[str, dict[float, float]] = {
     "preview": {1.0: 0.778, 0.0: 0.31},
 }
 
+#: What the tables are for: the number of executed actions, and the noise of the sources.
+PAPER_CHUNK, PAPER_DEFAULT_SIGMA = 8, {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
 
-PAPER_DEFAULT_SIGMA = {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
+
+def _setting(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
+    """Task, data and what policies see in a row, or None if it was played or trained unlike the paper's."""
+    texts = {name: value for name, value in row.items() if isinstance(value, str)}  # others are NaN
+    if row["chunk"] != PAPER_CHUNK or "delay" in row or row.get("temperature", 1.0) != 1.0:
+        return None
+    if texts.get("options") or texts.get("actions"):
+        return None
+    return row["task"], row["data"], texts.get("obs", STATE)
 
 
 def paper_success(row: Mapping[str, Any]) -> float:
@@ -60,14 +70,22 @@ def paper_success(row: Mapping[str, Any]) -> float:
     >>> [round(paper_success(row | more), 3) for more in ({}, {"obs": "image"}, {"sigma": 0.0})]
     [0.778, 0.751, 0.31]
     """
-    known = {name: value for name, value in row.items() if isinstance(value, str)}  # others are NaN
-    if row["chunk"] != 8 or "delay" in row or known.get("options") or known.get("actions"):
+    setting, prior, sigma = _setting(row), row["prior"], row["sigma"]
+    if setting == ("square", "mh", STATE) and row["nfe"] == 1 and sigma in PAPER_SIGMA.get(prior, {}):
+        return PAPER_SIGMA[prior][sigma]
+    if setting is None or sigma != PAPER_DEFAULT_SIGMA.get(prior):
         return math.nan
-    seen, prior = known.get("obs", STATE), row["prior"]
-    ablation = (row["task"], row["data"], seen, row["nfe"]) == ("square", "mh", STATE, 1)
-    if ablation and row["sigma"] in PAPER_SIGMA.get(prior, {}):
-        return PAPER_SIGMA[prior][row["sigma"]]
-    if row["sigma"] != PAPER_DEFAULT_SIGMA.get(prior):
+    return PAPER_SUCCESS.get(setting, {}).get(prior, {}).get(row["nfe"], math.nan) / 100
+
+
+def paper_curvature(row: Mapping[str, Any]) -> float:
+    """The paper's curvature relative to the Gaussian source's, likewise.
+
+    >>> row = {"task": "square", "data": "mh", "prior": "past", "sigma": 0.5, "chunk": 8}
+    >>> paper_curvature(row), paper_curvature(row | {"options": "correlation=0.5"})
+    (0.705, nan)
+    """
+    task, data, seen = _setting(row) or ("", "", "")
+    if seen != STATE or row["sigma"] != PAPER_DEFAULT_SIGMA.get(row["prior"]):
         return math.nan
-    percent = PAPER_SUCCESS.get((row["task"], row["data"], seen), {}).get(prior, {}).get(row["nfe"])
-    return math.nan if percent is None else percent / 100
+    return PAPER_CURVATURE.get((task, data), {}).get(row["prior"], math.nan)

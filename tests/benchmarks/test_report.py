@@ -19,6 +19,7 @@ import memory
 from lab import report
 from lab.files import PartialFailure
 from tests.benchmarks.script_parts import is_png
+from tests.paper_facts import SIGMA_SUCCESS, SUCCESS
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
 FACTS |= {"seed": 0, "iterations": 100, "checkpoint": 100, "nfe": 1, "temperature": 1.0}
@@ -144,14 +145,15 @@ def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
     others += [row(prior="past", data="mh", actions="absolute"), row(prior="past", task="lift")]
     found = [report.summary(pd.DataFrame([one]), 1).iloc[0] for one in (*same, *others)]
     values = [one["paper"] for one in found]
-    assert values[:3] == pytest.approx([0.701, 0.776, 0.05]) and np.isnan(values[3:]).all()
+    rates = [SUCCESS["square", "mh", obs][7] / 100 for obs in ("state", "image")]  # WP-Past at one step
+    assert values[:3] == pytest.approx([*rates, SIGMA_SUCCESS["past", 0.0]]) and np.isnan(values[3:]).all()
 
 
 def test_the_report_has_the_layout_of_table_1():
     text = table(compared(), source="scripted", notes=["A note."])
     assert text.startswith("| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |")
     assert cells_of(text, "Square-PH, measured (scr") == ["50.0", "**80.0** (+30.0*)", "50.0 (+0.0)"]
-    assert cells_of(text, "Square-PH, paper") == ["83.6", "86.6", "87.3"]
+    assert cells_of(text, "Square-PH, paper") == [f"{rate}" for rate in SUCCESS["square", "ph", "state"][-3:]]
     counts = [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
     assert counts == [("-", "-", "-"), ("9", "0", "1.00"), ("1", "1", "0.50")]
     assert "3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed" in text

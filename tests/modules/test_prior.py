@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.paper_facts import SIGMA
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
-PAPER_SIGMA = {GaussianPrior: 1.0, PastPrior: 0.5, PreviewPrior: 1.0}
 
 
 @pytest.mark.parametrize("prior_class", PRIORS)
@@ -18,7 +18,7 @@ def test_lengths_and_default_sigma(prior_class, horizon):
     prior = prior_class(horizon)
     assert prior.prediction_length == (2 * horizon if prior_class is PreviewPrior else horizon)
     assert prior.history_length == horizon
-    assert (prior.sigma, prior.correlation) == (PAPER_SIGMA[prior_class], 0.0)
+    assert (prior.sigma, prior.correlation) == (SIGMA[prior.name], 0.0)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5, 2.0])

@@ -167,11 +167,7 @@ def test_recipes_that_cannot_be(options, said):
         TrainingConfig(**options)
 
 
-def test_the_papers_recipe():
-    """Table 3."""
-    config = PAPER
-    assert (config.iterations, config.batch_size, config.learning_rate) == (200_000, 1024, 1e-4)
-    assert (config.weight_decay, config.warmup_ratio, config.ema_rate) == (1e-5, 0.2, 0.995)
-    assert config.checkpoint_iterations == [20_000 * i for i in range(1, 11)]
+def test_checkpoints_are_evenly_spaced():
+    assert PAPER.checkpoint_iterations == [20_000 * i for i in range(1, 11)]
     # No more than there are iterations.
     assert TrainingConfig(iterations=3, checkpoints=4).checkpoint_iterations == [1, 2, 3]

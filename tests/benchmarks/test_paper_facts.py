@@ -1,0 +1,311 @@
+"""Every number that the code has from the paper, compared with the table of facts."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from tests import paper_facts as facts
+from warmprior import (
+    ChiTransformer,
+    GaussianPrior,
+    ImageEncoder,
+    PastPrior,
+    PlainMLP,
+    PreviewPrior,
+    VelocityMLP,
+    WarmPriorActor,
+)
+from warmprior.diagnostics import curvature, flow_paths
+from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
+from warmprior.envs.tasks import TASKS
+from warmprior.objectives.self_distillation import TEACHER_STEPS
+from warmprior.rl import PriorSpaceConfig
+from warmprior.training import NetworkOptions, TrainingConfig
+from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+import mimicgen_tasks
+import prior_space_rl
+import robomimic
+
+from lab import paper
+from lab.options import IMAGES, PRESETS, with_parts
+from lab.tasks import navigation_task
+
+PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
+SCRIPTS = ("robomimic", "curvature", "sigma", "chunking", "budget", "real_time_chunking", "pusht")
+MIMICGEN = {task: (f"{task}_d0", "source") for task in facts.MIMICGEN_TASKS}
+SIZES = ("embedding_dim", "num_layers", "num_heads", "timestep_embedding_dim")
+OPTIMIZER = {"learning_rate": "lr", "weight_decay": "weight_decay", "betas": "betas", "eps": "eps"}
+STATE, IMAGE = facts.TABLE_3["state"], facts.TABLE_3["image"]
+
+
+class Parsed(Exception):
+    """Raised instead of the work of a script."""
+
+
+def presets_of(name, monkeypatch):
+    """The presets that a script reads its command line with."""
+    script, found = importlib.import_module(name), {}
+
+    def parse(presets, *args, **options):
+        found.update(presets)
+        raise Parsed
+
+    for module in (script, robomimic):  # some scripts are robomimic.py with presets of their own
+        monkeypatch.setattr(module, "parse", parse, raising=False)
+    with pytest.raises(Parsed):
+        script.main([])
+    return found
+
+
+def default(function, name):
+    return inspect.signature(function).parameters[name].default
+
+
+def values(source, names):
+    return {name: getattr(source, name) for name in names}
+
+
+def optimized(optimizer):
+    group = optimizer.param_groups[0]
+    return {name: group[key] for name, key in OPTIMIZER.items()}
+
+
+def recipe(options):
+    """The rows of Table 3, from what the options build."""
+    network, training = options.network.make(7, 9, 8), options.training
+    (dropout,) = {module.p for module in network.modules() if isinstance(module, nn.Dropout)}
+    rates = values(training, ("learning_rate", "weight_decay"))
+    found = {
+        **values(network, SIZES),
+        "dropout": dropout,
+        **optimized(make_optimizer(network, **rates)),
+        **values(training, ("warmup_ratio", "ema_rate", "precision", "batch_size", "iterations")),
+        "observation_steps": options.network.observation_steps,
+    }
+    if options.data.obs == "image":
+        found |= values(options.network, ("encoder", "crop_size")) | values(options.data, ("image_size",))
+    return found
+
+
+def evaluation(options, **others):
+    found = values(options.evaluation, ("episodes", "seeds", "top_k"))
+    nfe = tuple(sorted(options.evaluation.nfe))
+    return {**found, "nfe": nfe, "chunk": options.sources.chunk, **others}
+
+
+def test_the_paper_says_the_same_twice():
+    """The rollouts of its violins (appendix A), and the two peaks of its study of sigma."""
+    assert facts.EVALUATION["episodes"] * facts.EVALUATION["seeds"] == 600
+    *_, past, preview = facts.SUCCESS["square", "mh", "state"]
+    assert past / 100 == pytest.approx(facts.SIGMA_SUCCESS["past", 0.5])
+    assert preview / 100 == pytest.approx(facts.SIGMA_SUCCESS["preview", 1.0])
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_the_recipe_from_the_state(name, monkeypatch):
+    preset, usual = presets_of(name, monkeypatch)["paper"], facts.EVALUATION
+    assert isinstance(preset.network.make(7, 9, 8), ChiTransformer) and not preset.network.precondition
+    assert recipe(preset) == STATE
+    # Two studies have one NFE, and one has all chunk lengths.
+    own = {name: {"nfe": usual["nfe"]} for name in ("sigma", "real_time_chunking")}
+    own |= {"chunking": {"chunk": usual["chunk"]}}
+    assert evaluation(preset, **own.get(name, {})) == usual
+    assert preset.sources.prior == tuple(facts.SIGMA) and preset.evaluation.grid == "uniform"
+    loss = values(preset.training, ("times", "objective", "weighting", "self_distillation"))
+    assert tuple(loss.values()) == ("uniform", "velocity", "velocity", 0.0)
+    if name != "pusht":
+        # The official files of one operator hold 200, where Table 3 says 250.
+        assert preset.data.demonstrations == (200, facts.DEMONSTRATIONS["mh"])
+
+
+def test_the_recipe_from_images(monkeypatch):
+    assert recipe(with_parts(PRESETS["paper"], **IMAGES["paper"], data={"obs": "image"})) == IMAGE
+    preset = mimicgen_tasks.FEW["paper"]
+    assert evaluation(preset) == facts.EVALUATION
+    monkeypatch.setattr("lab.options.imagenet_weights", lambda: None)  # nothing is downloaded
+    asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
+    adapted = mimicgen_tasks.adapt(preset, asked)
+    assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
+    assert [(task, *adapted.data.data) for task in adapted.data.task] == list(MIMICGEN.values())
+    counts = {found.data.demonstrations for found in mimicgen_tasks.FEW.values()}
+    assert counts == {(facts.DEMONSTRATIONS["mimicgen"],)}
+
+
+def test_defaults_of_the_library():
+    assert {name: kind(8).sigma for name, kind in PRIORS.items()} == facts.SIGMA
+    sizes = {name: default(ChiTransformer, name) for name in (*SIZES, "dropout")}
+    assert STATE.items() >= sizes.items()
+    steps = [default(kind, "observation_steps") for kind in (ChiTransformer, VelocityMLP, PlainMLP)]
+    assert {*steps, NetworkOptions().observation_steps} == {STATE["observation_steps"]}
+    assert STATE.items() >= values(TrainingConfig(), ("weight_decay", "ema_rate", "precision")).items()
+    assert STATE.items() >= optimized(make_optimizer(VelocityMLP(1, 1, 1, hidden_dim=8))).items()
+    assert default(warmup_cosine, "warmup_ratio") == STATE["warmup_ratio"]
+    assert default(ema_of, "rate") == STATE["ema_rate"]
+    assert {
+        name: default(ImageEncoder, name) for name in ("image_size", "crop_size")
+    }.items() <= IMAGE.items()
+    assert max(facts.EVALUATION["nfe"]) == TEACHER_STEPS
+
+
+def test_the_images_network_has_group_norm():
+    pytest.importorskip("torchvision")
+    encoder = NetworkOptions("plain_mlp", encoder="resnet18").make(7, 9, 8, {"camera": 84}).encoder
+    kinds = {type(module) for module in encoder.modules() if "Norm" in type(module).__name__}
+    assert kinds == {nn.GroupNorm} and encoder.backbone == "resnet18"
+
+
+def test_tasks_have_the_papers_cameras_and_widths():
+    for task, count in facts.CAMERAS.items():
+        for name in MIMICGEN if task == "mimicgen" else (task,):
+            spec = TASKS[MIMICGEN[name][0] if name in MIMICGEN else name]
+            wrists = [camera for camera in spec.cameras if camera.endswith("eye_in_hand")]
+            assert (len(spec.cameras), 2 * len(wrists)) == (count, count)
+    assert tuple(sorted({spec.action_dim for spec in TASKS.values()})) == facts.ACTION_DIM
+    hang = TASKS["tool_hang"]  # beside images there is the robot's own part; Transport's 59 are beyond
+    assert (hang.observation_dim - hang.object_dim, hang.observation_dim) == facts.STATE_DIM
+
+
+def test_the_transformer_that_is_measured_beside_others():
+    from peers import PEERS
+    from throughput import paper_network
+
+    widths = {PEERS["warmprior_transformer"][1], paper_network().embedding_dim}
+    assert widths == {facts.TRAINING["embedding_dim"]}
+
+
+def row(task, data, obs, prior, nfe, **more):
+    """A row of results, of the paper's own experiment."""
+    place = {"task": task, "data": data, "obs": obs, "prior": prior, "nfe": nfe}
+    return {**place, "sigma": facts.SIGMA[prior], "chunk": 8, **more}
+
+
+def table_1():
+    """Every entry: where it is, and the rate."""
+    for (task, data, obs), rates in facts.SUCCESS.items():
+        task, data = MIMICGEN[task] if data == "mimicgen" else (task, data)
+        places = ((task, data, obs, prior, nfe) for nfe in (9, 3, 1) for prior in PRIORS)
+        yield from zip(places, rates, strict=True)
+
+
+def test_every_entry_of_table_1():
+    entries = dict(table_1())
+    stored = {
+        (*setting, prior, nfe): rate
+        for setting, priors in paper.PAPER_SUCCESS.items()
+        for prior, rates in priors.items()
+        for nfe, rate in rates.items()
+    }
+    assert stored == entries and len(entries) == 13 * 9
+    for place, rate in entries.items():
+        assert paper.paper_success(row(*place)) == pytest.approx(rate / 100)
+
+
+def test_every_entry_of_table_2():
+    entries = {
+        setting: dict(zip(("past", "preview"), pair, strict=True))
+        for setting, pair in facts.CURVATURE.items()
+    }
+    assert entries == paper.PAPER_CURVATURE
+    others = ({"obs": "image"}, {"sigma": 0.3}, {"options": "correlation=0.5"}, {"chunk": 4})
+    for (task, data), ratios in entries.items():
+        for prior, ratio in ratios.items():
+            one = row(task, data, "state", prior, 9)
+            assert paper.paper_curvature(one) == ratio
+            assert all(math.isnan(paper.paper_curvature(one | more)) for more in others)
+
+
+def test_the_study_of_sigma_has_rates_of_its_own():
+    assert facts.EVALUATION["chunk"] == (paper.PAPER_CHUNK,) and facts.SIGMA == paper.PAPER_DEFAULT_SIGMA
+    stored = {
+        (prior, sigma): rate for prior, rates in paper.PAPER_SIGMA.items() for sigma, rate in rates.items()
+    }
+    assert stored == facts.SIGMA_SUCCESS
+    others = [{"chunk": 1}, {"options": "correlation=0.5"}, {"temperature": 0.5}, {"actions": "absolute"}]
+    elsewhere = [{"obs": "image"}, {"nfe": 3}, {"data": "ph"}, {"task": "transport"}]
+    for (prior, sigma), rate in stored.items():
+        one = row("square", "mh", "state", prior, 1, sigma=sigma)
+        assert paper.paper_success(one) == rate
+        without = others + (elsewhere if sigma == 0 else [])
+        assert all(math.isnan(paper.paper_success(one | more)) for more in without)
+
+
+def test_the_study_of_sigma(monkeypatch):
+    presets = presets_of("sigma", monkeypatch)
+    for preset in presets.values():
+        assert preset.sources.sigma == facts.SIGMAS and preset.evaluation.nfe == facts.SIGMA_STUDY["nfe"]
+    assert evaluation(presets["paper"]).items() >= facts.SIGMA_STUDY.items()
+
+
+def test_the_curvature(monkeypatch):
+    assert default(curvature, "n_steps") == default(flow_paths, "n_steps") == facts.CURVATURE_STEPS
+    for preset in presets_of("curvature", monkeypatch).values():
+        assert preset.observations == facts.CURVATURE_OBSERVATIONS
+
+
+def test_the_study_without_chunks(monkeypatch):
+    for preset in presets_of("chunking", monkeypatch).values():
+        assert {facts.NO_CHUNKS["chunk"], *facts.EVALUATION["chunk"]} <= {*preset.sources.chunk}
+        assert facts.NO_CHUNKS["nfe"] in preset.evaluation.nfe
+
+
+def test_the_toy(monkeypatch):
+    presets, toy = presets_of("navigation1d", monkeypatch), facts.TOY
+    preset = presets["paper"]
+    network = preset.network.make(1, facts.TOY_OBSERVATION_DIM, 4)
+    layers = [module for module in network.modules() if isinstance(module, nn.Linear)]
+    assert isinstance(network, PlainMLP) and len(layers) == toy["layers"]
+    widths = {layer.out_features for layer in layers[:-1]}
+    assert widths == {toy["width"]} == {default(PlainMLP, "hidden_dim")}
+    assert toy.items() >= values(preset.training, ("iterations", "batch_size")).items()
+    # The rest of the recipe is that of its robot tasks.
+    rest = ("learning_rate", "weight_decay", "warmup_ratio", "ema_rate", "precision")
+    assert STATE.items() >= values(preset.training, rest).items()
+    assert all(found.sources.sigma == toy["sigma"] for found in presets.values())
+    assert preset.position_only and not preset.network.precondition
+    assert navigation_task("position").data["observation"].shape[-1] == facts.TOY_OBSERVATION_DIM
+    heights = navigation_heights()
+    assert (len(heights), len(OBSTACLES)) == (facts.TOY_DEMONSTRATIONS, facts.TOY_OBSTACLES)
+    for side in (heights > 0, heights < 0):
+        assert 2 * side.all(1).sum() == facts.TOY_DEMONSTRATIONS
+
+
+def test_the_agents():
+    presets = prior_space_rl.AGENT_PRESETS
+    preset = presets["paper"]
+    assert (preset.algorithm, preset.warm_algorithm) == (facts.AGENTS["baselines"], facts.AGENTS["warm"])
+    assert preset.evaluation.seeds == facts.AGENTS["seeds"] and preset.sources.prior == tuple(facts.SIGMA)
+    assert recipe(preset) == STATE  # of the frozen policies
+    for name, kind in PRIORS.items():
+        prior = kind(2)
+        actor = WarmPriorActor(VelocityMLP(1, 1, prior.prediction_length, hidden_dim=8), prior)
+        expected = facts.BOX_AROUND_ZERO if name == "gaussian" else facts.BOX_AROUND_MEAN
+        assert PriorSpaceConfig().box(actor) == expected
+    assert presets["unit"].delta == (facts.BOX_AROUND_MEAN, facts.BOX_AROUND_ZERO)
+
+
+def test_the_policy_for_lerobot():
+    for package in ("lerobot", "transformers", "lerobot_policy_warmprior"):
+        pytest.importorskip(package)
+    from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig, WarmupRatioConfig
+
+    config = WarmFlowConfig()
+    names = ("embedding_dim", "num_layers", "num_heads", "dropout", "ema_rate")
+    assert IMAGE.items() >= values(config, (*names, "encoder", "image_size", "crop_size")).items()
+    weights = [nn.Parameter(torch.zeros(1))]
+    assert IMAGE.items() >= optimized(config.get_optimizer_preset().build(weights)).items()
+    assert WarmupRatioConfig().warmup_ratio == IMAGE["warmup_ratio"]
+    assert config.get_scheduler_preset().warmup_ratio == IMAGE["warmup_ratio"]
+    assert config.n_obs_steps == IMAGE["observation_steps"]
+    assert (config.n_action_steps,) == facts.EVALUATION["chunk"]
+    assert config.make_prior().sigma == facts.SIGMA["past"]
