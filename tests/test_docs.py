@@ -156,6 +156,7 @@ def test_the_table_of_results_is_that_of_the_stored_numbers():
     spec.loader.exec_module(results)
     assert results.table() in results.PAGE.read_text()
     assert results.human_table() in (DOCS / "evidence.md").read_text()
+    assert results.paper_table() in (DOCS / "paper.md").read_text()
     shown = set(re.findall(r"\(_static/results/(\w+)\.png\)", results.PAGE.read_text()))
     assert shown == {path.stem for path in results.OUT.glob("*.png")}
     for file in results.DATA.glob("*.csv"):

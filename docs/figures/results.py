@@ -1,6 +1,7 @@
 """The charts and the table of the results page, from the numbers in docs/results.
 
-python docs/figures/results.py    # or: make results; writes docs/_static/results and two pages' tables
+PYTHONPATH=benchmarks python docs/figures/results.py    # or: make results; writes docs/_static/results and
+                                                        # three pages' tables
 
 An interval is of 95%. A success rate has Wilson's score interval, a difference of two Newcombe's. Both take
 the episodes of all seeds as independent; training seeds differ by more than that, paired episodes by less.
@@ -9,12 +10,15 @@ the episodes of all seeds as independent; training seeds differ by more than tha
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pandas import DataFrame, Series, read_csv
+from pandas import DataFrame, Series, concat, read_csv, read_json
+
+from lab.paper import PAPER_DEFAULT_SIGMA, PAPER_SUCCESS, STATE
 
 DOCS = Path(__file__).parents[1]
 DATA, OUT, PAGE = DOCS / "results", DOCS / "_static" / "results", DOCS / "results.md"
@@ -321,13 +325,54 @@ def table() -> str:
     return "\n".join(text) + "\n"
 
 
+def papers_settings() -> DataFrame:
+    """Success in settings of the paper's Table 1, from the state: a row per training, NFE and source."""
+    longest = read_json(DATA / "square_mh_80000.jsonl", lines=True)
+    plain = (longest["options"] == "") & (longest["sigma"] == longest["prior"].map(PAPER_DEFAULT_SIGMA))
+    longest = longest[plain].rename(columns={"data": "style", "prior": "source"})
+    keys = ["task", "style", "iterations", "source", "nfe"]
+    longest = longest.groupby(keys, as_index=False).agg(
+        success=("success_rate", lambda rates: 100 * rates.mean()), seeds=("seed", "nunique")
+    )
+    steps, longer = read("steps"), read("iterations")
+    steps = steps[steps["demonstrations"] >= 150]
+    longer = longer[(longer["iterations"] > 10_000) & (longer["weighting"] == "standardised")]
+    # A training with more seeds has those of the one with fewer.
+    return concat([steps, longer, longest]).sort_values("seeds").drop_duplicates(keys, keep="last")
+
+
+def paper_table() -> str:
+    """The paper's Table 1 beside these rows, in Markdown: success at NFE 9 / 3 / 1."""
+
+    def line(title: str, place: str, rates: Mapping[tuple[str, int], float]) -> str:
+        each = [
+            [rates.get((source, nfe), np.nan) for nfe in (9, 3, 1)] for source in (GAUSSIAN, PAST, PREVIEW)
+        ]
+        texts = [" / ".join("-" if np.isnan(n) else f"{n + 1e-6:.0f}" for n in part) for part in each]
+        return f"| {title} | {place} | {' | '.join(texts)} |"
+
+    text = ["| | | Gaussian source | WP-Past | WP-Preview |", "|---|---|---|---|---|"]
+    rows = papers_settings()
+    for (task, style, seen), paper in PAPER_SUCCESS.items():
+        ours = rows[(rows["task"] == task) & (rows["style"] == style)]
+        if seen == STATE and len(ours):
+            known = {(source, nfe): rate for source, rates in paper.items() for nfe, rate in rates.items()}
+            text.append(line(f"{task} {style}", "the paper", known))
+            for iterations, part in ours.groupby("iterations"):
+                seeds = {1: "1 seed"}.get(part["seeds"].max(), f"{part['seeds'].max()} seeds")
+                rates = dict(zip(zip(part["source"], part["nfe"], strict=True), part["success"], strict=True))
+                text.append(line("", f"here, {iterations:,} iterations, {seeds}", rates))
+    return "\n".join(text) + "\n"
+
+
 def main() -> None:
     """Draw the charts, and write the tables into the pages."""
     OUT.mkdir(parents=True, exist_ok=True)
     for draw in one_step, steps, demonstrations, iterations, memory, noise, actions, human:
         draw()
     marked = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
-    for page, text in ((PAGE, table()), (DOCS / "evidence.md", human_table())):
+    pages = {PAGE: table(), DOCS / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
+    for page, text in pages.items():
         page.write_text(marked.sub(text, page.read_text()))
 
 
