@@ -37,7 +37,7 @@ import mimicgen_tasks
 import prior_space_rl
 import robomimic
 
-from lab import paper
+from lab import paper, timing
 from lab.options import IMAGES, PRESETS, with_parts
 from lab.tasks import navigation_task
 
@@ -176,12 +176,13 @@ def test_tasks_have_the_papers_cameras_and_widths():
     assert (hang.observation_dim - hang.object_dim, hang.observation_dim) == facts.STATE_DIM
 
 
-def test_the_transformer_that_is_measured_beside_others():
+def test_speed_is_measured_at_the_papers_sizes():
     from peers import PEERS
     from throughput import paper_network
 
     widths = {PEERS["warmprior_transformer"][1], paper_network().embedding_dim}
-    assert widths == {facts.TRAINING["embedding_dim"]}
+    assert widths == {STATE["embedding_dim"]} and STATE["observation_steps"] == timing.TO
+    assert (facts.EVALUATION["nfe"], facts.EVALUATION["chunk"]) == (timing.NFES, (timing.H,))
 
 
 def row(task, data, obs, prior, nfe, **more):
