@@ -232,7 +232,8 @@ def test_the_study_of_sigma_has_rates_of_its_own():
         (prior, sigma): rate for prior, rates in paper.PAPER_SIGMA.items() for sigma, rate in rates.items()
     }
     assert stored == facts.SIGMA_SUCCESS
-    others = [{"chunk": 1}, {"options": "correlation=0.5"}, {"temperature": 0.5}, {"actions": "absolute"}]
+    others = [{"chunk": 1}, {"delay": 0}, {"temperature": 0.5}, {"actions": "absolute"}]
+    others += [{"options": "correlation=0.5"}]
     elsewhere = [{"obs": "image"}, {"nfe": 3}, {"data": "ph"}, {"task": "transport"}]
     for (prior, sigma), rate in stored.items():
         one = row("square", "mh", "state", prior, 1, sigma=sigma)
