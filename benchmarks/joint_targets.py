@@ -13,12 +13,10 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from robomimic import run
 from tqdm import tqdm
 
@@ -26,7 +24,6 @@ from lab.options import PRESETS, script, with_parts
 from lab.scripted.episode import Episode, write_robomimic
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
-from warmprior import RestingJoints
 from warmprior.data.hdf5 import open_robomimic, selected_demos
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
@@ -123,11 +120,7 @@ def task(options: DataOptions) -> Task:
     if style not in ("ph", "mh"):
         raise ValueError(f"--data {style} has no scripted demonstrations: name ph or mh")
     path = demonstrations(style, options.count(style))
-    made = Task.open(path, style=style, observation_keys=OBSERVATION)
-    joints = made.data["action"].shape[-1] - 1
-    first = made.vector.shape[-1] - joints - 2  # before them the object, after them the two fingers
-    columns = torch.tensor([*range(first, first + joints), -1])
-    return replace(made, rest=RestingJoints(columns, made.normalizer))
+    return Task.open(path, style=style, observation_keys=OBSERVATION, joint_key=f"{ARM}joint_pos")
 
 
 PLAYED = {"data": {"task": ("joint_targets:task",)}}

@@ -143,6 +143,7 @@ class Train:
         chunk: chunk length H.
         nfe: network evaluations per chunk, saved with the policy.
         observation_keys: what policies see, in this order (default: the task's).
+        joint_key: of these the one that actions are absolute targets of, such as observation.state.
         image_keys: images that they see, beside the robot's state, such as agentview_image.
         fast_rendering: whether robosuite's images are without reflections, shadows and smooth edges.
         actions: what policies predict: as recorded, or the absolute poses that robosuite's deltas ask for.
@@ -163,6 +164,7 @@ class Train:
     chunk: int = 8
     nfe: int = DEFAULT_NFE
     observation_keys: tuple[str, ...] | None = None
+    joint_key: str | None = None
     image_keys: tuple[str, ...] = ()
     fast_rendering: bool = False
     actions: Literal["delta", "absolute"] = "delta"
@@ -201,6 +203,7 @@ def train(args: argparse.Namespace) -> None:
         observation_steps=options.network.observation_steps,
         actions=options.actions,
         observation_keys=options.observation_keys,
+        joint_key=options.joint_key,
         image_keys=options.image_keys,
         fast_rendering=options.fast_rendering,
         mask=options.mask,

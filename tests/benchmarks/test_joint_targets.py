@@ -35,6 +35,7 @@ def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
     env = task.make_env()
     assert task.data["observation"].shape[-1] == 14 + 7 + 2
     assert task.data["action"].shape[-1] == 8
+    assert task.rest.columns.tolist() == [*range(14, 21), -1]
     assert env.action_spec.shape == (8,)
     env.close()
     assert joint_targets.demonstrations("ph", 1) == path  # recorded once

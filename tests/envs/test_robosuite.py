@@ -55,6 +55,17 @@ def test_specs(lift):
     torch.testing.assert_close(lift.action_spec.space.high, torch.ones(7))
 
 
+@pytest.mark.parametrize("loop", ["lean", "robosuite"])
+def test_objects_are_where_they_are_whatever_else_is_observed(loop):
+    """Positions relative to the gripper are part of them."""
+    actions = torch.rand(6, 7, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    whole = RobosuiteEnv("square", control_loop=loop, seed=4)
+    alone = RobosuiteEnv("square", control_loop=loop, seed=4, low_dim_keys=["object"])
+    torch.testing.assert_close(play(alone, actions), play(whole, actions)[:, :14])
+    whole.close()
+    alone.close()
+
+
 def test_absolute_joint_targets():
     env_args = task_env_args("lift")
     part = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]

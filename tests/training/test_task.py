@@ -114,6 +114,63 @@ def test_absolute_actions_have_the_units_of_deltas(path):
     assert trends[0] is None and isinstance(trends[1], PoseTrend)
 
 
+def joint_steps(n=400):
+    """Two joints that follow their targets, the second in other units, and a gripper's command."""
+    g = torch.Generator().manual_seed(0)
+    joints = torch.randn(n, 2, generator=g).cumsum(0) * torch.tensor([0.1, 30.0])
+    moves = torch.randn(n, 2, generator=g) * torch.tensor([0.1, 30.0])
+    command = torch.rand(n, 1, generator=g).round()
+    seen = torch.cat([torch.randn(n, 1, generator=g), joints.flip(-1)], -1)
+    return seen, torch.cat([joints + moves, command], -1), moves
+
+
+def test_joint_targets_are_learnt_from_where_the_joints_are():
+    seen, action, moves = joint_steps()
+    plain = Task.of("arm", steps(400, observation=seen, action=action))
+    task = plain.with_joints([2, 1, -1])
+    assert (
+        task.identity
+        != plain.identity
+        == Task.of("arm", steps(400, observation=seen, action=action)).identity
+    )
+    rest = task.normalizer.denormalize(TensorDict({"action": task.rest(task.data["observation"])}, [400]))
+    torch.testing.assert_close(rest["action"][:, :2], seen[:, [2, 1]], rtol=1e-4, atol=1e-4)
+    options = NetworkOptions(hidden_dim=16, observation_steps=1)
+    with_trend, without = (
+        new_policy(t, GaussianPrior(1), options, TrainingConfig()).network for t in (task, plain)
+    )
+    # At t = 0 the remainder is that of the moves, where it was that of the targets.
+    start, units = torch.zeros(1), task.normalizer.scale("action")
+    found, before = (network.remainder(start)[0, 0] * units for network in (with_trend, without))
+    torch.testing.assert_close(found[:2], moves.std(0), rtol=0.1, atol=0)
+    torch.testing.assert_close(before[:2], action[:, :2].std(0), rtol=0.1, atol=0)
+    assert found[2] == pytest.approx(float(before[2]), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [([1, 2, -1], "action 0 of arm .* number 1"), ([2, 1], "3 numbers"), ([2, 3, -1], "from -1 to 2")],
+)
+def test_targets_of_something_else_are_refused(columns, said):
+    seen, action, _ = joint_steps()
+    with pytest.raises(ValueError, match=said):
+        Task.of("arm", steps(400, observation=seen, action=action)).with_joints(columns)
+
+
+def test_joint_targets_beside_images():
+    seen, action, _ = joint_steps(60)
+    images = torch.zeros(60, 3, 16, 16, dtype=torch.uint8)
+    observation = TensorDict({"state": seen, "front": images}, [60])
+    task = Task.of("arm", steps(60, observation=observation, action=action)).with_joints([2, 1, -1])
+    options = NetworkOptions(hidden_dim=16, observation_steps=1, encoder="small", crop_size=12)
+    network = new_policy(task, GaussianPrior(1), options, TrainingConfig()).network
+    data = task.data[:5]["observation"].unsqueeze(1)
+    source, target = network.trend(network.encode(data))
+    expected = network.trend(data["state"])
+    torch.testing.assert_close(target, expected[1])
+    assert source.abs().max() < 0.2 < target.abs().max()
+
+
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 

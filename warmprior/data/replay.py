@@ -444,6 +444,13 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
         return torch.tensor(columns)
 
+    def joint_columns(self, key: str) -> list[int]:
+        """For each action the column of ``"observation"`` that it is a target of, as ``key`` goes, or -1."""
+        check_choice("joint_key", key, self.observation_keys)
+        index, position = self._index, self.observation_keys.index(key)
+        first, width = sum(index.observation_dims[:position]), index.observation_dims[position]
+        return [first + action if action < width else -1 for action in range(index.action_dim)]
+
     @property
     def num_episodes(self) -> int:
         """The number of demos read."""

@@ -168,8 +168,9 @@ class StepLoop:
     def _select(self, keys: Sequence[str] | None) -> None:
         observables = self.env._observables
         for name, observable in observables.items():
-            # Inactive ones (grip poses) stay enabled: the object sensors read them.
-            if keys is not None and observable.is_active() and observable.modality != "object":
+            # Inactive ones (grip poses) and the grippers' poses stay enabled: the object sensors read them.
+            read = observable.modality == "object" or name.endswith(("eef_pos", "eef_quat"))
+            if keys is not None and observable.is_active() and not read:
                 self.env.modify_observable(name, "enabled", name in keys)
         self._names = {
             name: "object" if name == "object-state" else name

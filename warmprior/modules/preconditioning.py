@@ -66,7 +66,8 @@ class RestingAction(nn.Module):
         ]
         if normalizer is not None:
             ends = normalizer.loc, normalizer.scale
-            affine = [end(keys.OBSERVATION)[columns] for end in ends]
+            vector = next(key for key in normalizer.keys if key != keys.ACTION)
+            affine = [end(vector)[columns] for end in ends]
             affine += [end(keys.ACTION).reshape(action_shape) for end in ends]
         self.register_buffer("columns", columns)
         for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
@@ -222,7 +223,7 @@ class PoseTrend(nn.Module):
         The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
         is of the source samples, on the windows' device.
         """
-        resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
+        resting = rest(_vector(windows[keys.OBSERVATION])[:, -1].float()).double()
         centre = resting.mean(0)
         source = prior.distribution(windows[keys.HISTORY], windows[keys.OBSERVATION])
         draws = [source.sample(generator).double() for _ in range(DRAWS)]
@@ -242,9 +243,9 @@ class PoseTrend(nn.Module):
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
 
-        Of normalised observations ``[B, To, d_o]`` the last step counts.
+        Of normalised observations ``[B, To, d_o]`` the last step counts; of images and a state, the state.
         """
-        deviation = (self.rest(observation[:, -1]) - self.centre).unsqueeze(1)
+        deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).unsqueeze(1)
         return deviation * self.source, deviation * self.target
 
 
@@ -523,6 +524,11 @@ class PreconditionedNetwork(VelocityNetwork):
         learnt = self.network(t, standardised, observation)
         velocity = torch.addcmul(covariance * standardised, remainder, learnt)
         return torch.addcmul(_combination(m0, d_alpha, m1, d_beta), scale, velocity)
+
+
+def _vector(observation: Tensor | TensorDictBase) -> Tensor:
+    """The observation, or the robot's state beside images; an encoder's features begin with it."""
+    return observation[keys.STATE] if isinstance(observation, TensorDictBase) else observation
 
 
 def _combination(x: Tensor, x_weight: Tensor, y: Tensor, y_weight: Tensor) -> Tensor:

@@ -20,10 +20,13 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.preconditioning import RestingAction
+from warmprior.modules.preconditioning import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.modules.prior import Prior
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
+
+NEAR = 0.5
+"""Share of an action's variance that its distance from what it is a target of may have."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Task:
         facts: what results say about the data, as JSON.
         adapters: transforms next to the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
-        rest: for absolute actions, see :class:`~warmprior.PoseTrend`.
+        rest: for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
         clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for none.
         environment: what a saved policy keeps of the environment, see
             :func:`~warmprior.envs.environment_of`.
@@ -163,6 +166,7 @@ class Task:
         observation_steps: int = 2,
         actions: Literal["delta", "absolute"] = "delta",
         observation_keys: Sequence[str] | None = None,
+        joint_key: str | None = None,
         image_keys: Sequence[str] = (),
         fast_rendering: bool = False,
         mask: str | None = None,
@@ -184,6 +188,8 @@ class Task:
             observation_steps: ``To`` of the policies.
             actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
             observation_keys: observations to concatenate; the task's by default, or of a Minari dataset all.
+            joint_key: of these the one that actions are absolute targets of, number by number, such as the
+                positions of joints; actions beyond its width are none (see :meth:`with_joints`).
             image_keys: images that policies see, beside the state of the robot, such as
                 ``"agentview_image"``; none by default.
             fast_rendering: whether the images are without reflections, shadows and smooth edges.
@@ -195,7 +201,7 @@ class Task:
         Raises:
             FileNotFoundError: if there is no such file or dataset.
             DatasetError: if it is not as it should be, or its images are not what the simulator shows.
-            ValueError: if the file is of another task.
+            ValueError: if the file is of another task, or its actions are not near ``joint_key``.
 
         Examples:
             >>> from warmprior.training import Task
@@ -215,8 +221,10 @@ class Task:
         if make_env is not None or not index.env_args:
             storage = "memmap" if image_keys else "memory"
             chosen: dict[str, Any] = {"observation_keys": observation_keys, "image_keys": image_keys}
-            data = found.replay(demos=demos, storage=storage, **chosen).data
-            opened = cls.of(name_of_place(place), data, make_env, style=style or "human", **outcome)
+            replay = found.replay(demos=demos, storage=storage, **chosen)
+            opened = cls.of(name_of_place(place), replay.data, make_env, style=style or "human", **outcome)
+            if joint_key is not None:
+                opened = opened.with_joints(replay.joint_columns(joint_key))
             said = opened.facts | {"source": "file", "file": found.name}
             environment = None if make_env is not None or image_keys else found.environment()
             if environment is None:
@@ -257,7 +265,48 @@ class Task:
         facts |= {"demonstrations": dataset.num_episodes, "steps": len(dataset.data), **space}
         # Images are drawn by what is installed.
         digest = digest_of(sha256, demos, space, images and renderer_versions())
-        return cls(name, style, facts=facts, digest=digest, **recorded)
+        made = cls(name, style, facts=facts, digest=digest, **recorded)
+        return made if joint_key is None else made.with_joints(dataset.joint_columns(joint_key))
+
+    def with_joints(self, columns: Sequence[int]) -> Self:
+        """The task whose actions are absolute targets of what is observed, such as the positions of joints.
+
+        A preconditioned network then learns where to go from there (:class:`~warmprior.RestingJoints`).
+
+        Args:
+            columns: for each action the number of the observation that it is a target of, in the same units;
+                -1 for an action that is none.
+
+        Raises:
+            ValueError: if there is no such number, or an action is not near it.
+
+        Examples:
+            >>> import torch
+            >>> from tensordict import TensorDict
+            >>> from warmprior.training import Task
+            >>> joints = torch.rand(60, 3)
+            >>> steps = {"observation": joints, "action": joints[:, 1:] + 0.01}
+            >>> steps = TensorDict(steps | {"episode": torch.arange(60) // 20}, [60])
+            >>> task = Task.of("arm", steps).with_joints([1, 2])
+            >>> task.rest.columns.tolist()
+            [1, 2]
+        """
+        actions, width = self.data[ACTION], self.vector.shape[-1]
+        if self.rest is not None or self.normalizer is None:
+            raise ValueError("joints are of actions as they were recorded: leave out actions='absolute'")
+        if len(columns) != actions.shape[-1] or not all(-1 <= column < width for column in columns):
+            raise ValueError(
+                f"columns are {actions.shape[-1]} numbers from -1 to {width - 1}, got {list(columns)}"
+            )
+        rest = RestingJoints(torch.tensor(columns), self.normalizer)
+        off, spread = actions - rest(self.vector), actions - actions.mean(0)
+        far = off.square().mean(0) > NEAR * spread.square().mean(0) + VARIANCE_FLOOR
+        if wrong := [i for i, column in enumerate(columns) if column >= 0 and far[i]]:
+            raise ValueError(
+                f"action {wrong[0]} of {self.name} is not near number {columns[wrong[0]]} of the "
+                "observation: name what actions are targets of, in the same order and units"
+            )
+        return replace(self, rest=rest)
 
     def env(
         self,
@@ -312,12 +361,13 @@ class Task:
     @cached_property
     def identity(self) -> str:
         """Digest of the data, part of the identity of every policy that is trained on them."""
+        joints = [self.rest.columns.tolist()] if isinstance(self.rest, RestingJoints) else []
         if self.digest:
-            return self.digest
+            return digest_of(self.digest, joints) if joints else self.digest
         # Data in other units may be equal once they are normalised.
         units = self.normalizer.state_dict() if self.normalizer else {}
         data = data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
-        return digest_of(data, {key: value.tolist() for key, value in units.items()})
+        return digest_of(data, {key: value.tolist() for key, value in units.items()}, *joints)
 
     @property
     def vector(self) -> Tensor:
