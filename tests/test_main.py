@@ -123,6 +123,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         (["info", str(tmp_path / "missing")], "no policy at"),
         (["info", __file__], "it is a file, and a policy is a folder"),
         (["info", str(tmp_path)], "it holds the policies bare: name one of them"),
+        (["train", str(tmp_path)], f"is a folder: name a file, or a LeRobotDataset as lerobot:{tmp_path}"),
         (["push", str(bare), "name", "--dry-run"], "'name' is no name of a repository"),
         (["evaluate", str(saved[0]), "--video", "out.txt"], "out.txt must end in .mp4"),
     ):
@@ -171,5 +172,10 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
     actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
+    # Its actions are not near the arm; and of what it has, observations alone are named.
+    for more, message in (("--joint-key arm", "action 0 of cups"), ("--observation-keys leg", "leg")):
+        assert main([*words.split(), *more.split(), "--out", str(tmp_path / "out")]) == 2
+        said = capsys.readouterr().err
+        assert message in said and "timestamp" not in said
     assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
     assert "2 demonstrations, fewer than demos=3" in capsys.readouterr().err

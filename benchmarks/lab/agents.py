@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Compose
 from lab.comparison import train_all
 from lab.methods import ColdPrior, Method
 from lab.options import FinishedRun, Options, check_given, check_single
-from lab.policies import check_environment, facts_of, finished_policies, policies_of, trained_actors
+from lab.policies import facts_of, finished_policies, policies_of, trained_actors
 from lab.tasks import check_counts, check_network
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
 from warmprior.envs import NavigationEnv
@@ -144,7 +144,7 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
     run = options.policies
     policies = policies_of(options) if run is None else finished_policies(run, options)
     if not options.is_toy:
-        check_environment(policies[0].task(), options.evaluation)
+        policies[0].task().check_environment(**options.evaluation.environment)
     if run is None:
         train_all(options, policies)
     actors = trained_actors(policies, options.run.device)

@@ -17,7 +17,7 @@ from lab.leader import go_on_alone
 from lab.measures import measure
 from lab.methods import Method
 from lab.options import Evaluation, Options
-from lab.policies import Cell, Policy, check_environment, facts_of, play, row, train, write_rows
+from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
 from lab.rows import PLAYED, read_rows
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import from_leader, rank, world_size
@@ -40,7 +40,7 @@ def compare(
     evaluation, places = options.evaluation, {p.name: i for i, p in enumerate(policies)}
     for policy in {policy.place: policy for policy in policies}.values():
         # What cannot be played is better known before the hours of training.
-        from_leader(partial(check_environment, policy.task(), evaluation))
+        from_leader(partial(policy.task().check_environment, **evaluation.environment))
 
     def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
         delays = row.get("delay") or 0, row.get("guidance") or ""

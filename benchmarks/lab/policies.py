@@ -31,12 +31,10 @@ from lab.options import Evaluation, Options, Run, of_run, stored_options, with_p
 from lab.rows import read_rows
 from lab.source_errors import mean_revision
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
-from warmprior import GaussianPrior, WarmPriorActor
+from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
-from warmprior.keys import CHUNK
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
     Episode,
@@ -147,36 +145,6 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
                     like = Policy(place, options.data, network, method, seeded, run, grid)
                     found.append(policy_of(task, like, method))
     return list({policy.folder: policy for policy in found}.values())
-
-
-def check_environment(task: Task, evaluation: Evaluation) -> None:
-    """Build the environment of a task, reset it and step once; a ``ValueError`` if that does not work."""
-    env: EnvBase | None = None
-    try:
-        env = base = task.make_env(**evaluation.environment)
-        env = task.env(GaussianPrior(1), base)
-        known = list(base.observation_spec.keys(True, True))
-        for key in (task.success, *task.measures):
-            if key not in known:
-                raise ValueError(f"it does not write {key!r} beside its reward: it writes {known}")
-        widths = {"observation": task.vector.shape[-1], "action": task.data["action"].shape[-1]}
-        specs = {"observation": base.observation_spec, "action": env.full_action_spec}
-        for (key, width), place in zip(widths.items(), ("observation", CHUNK), strict=True):
-            spec = specs[key]
-            theirs = spec[place].shape[-1:] if place in spec.keys(True, True) else None
-            if theirs != (width,):
-                raise ValueError(
-                    f"its {key!r} has the width {theirs}, and that of its demonstrations {width}"
-                )
-        env.set_seed(EVALUATION_SEED)
-        env.step(env.reset().set(CHUNK, task.data["action"][:1].to("cpu")))
-    except Exception as error:  # of a simulator, or of code of a user's
-        reason = error.args[0] if isinstance(error, KeyError) and error.args else error
-        file = f" ({task.facts['file']})" if "file" in task.facts else ""
-        raise ValueError(f"the environment of {title_of(task)}{file} cannot be played: {reason}") from error
-    finally:
-        if env is not None:
-            env.close()
 
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:

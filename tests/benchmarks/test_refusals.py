@@ -38,7 +38,6 @@ def no_work(monkeypatch):
         ("robomimic", "--device cuda:99", "--device cuda:99 does not work here"),
         ("robomimic", f"{FILE} --task can", "holds demonstrations of lift"),
         ("robomimic", f"{FILE} --demonstrations 2 3", "--demonstrations takes one number with --dataset"),
-        ("robomimic", "--prior regression --nfe 9", "regression is trained for --nfe 1 alone"),
         ("robomimic", "--prior ot --batch-size 1", "ot pairs within a batch"),
         ("robomimic", f"--task {DRIFT}:task {DRIFT}:other", "two tasks are called drift"),
         ("robomimic", "--no-precondition --weighting standardised", "needs --weighting velocity"),

@@ -154,7 +154,7 @@ def test_nothing_named_in_a_dataset_is_imported(root):
     for there, other in (("Pendulum-v1", "evil-v1"), ("Pendulum-v1", "evil:Pendulum-v1")):
         metadata.write_text(text.replace(there, other))
         task = Task.open(f"minari:{name}")
-        with pytest.raises(ValueError, match=other):
+        with pytest.raises((ImportError, ValueError), match=other):
             task.make_env()
     entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
     assert entry in text

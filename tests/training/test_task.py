@@ -14,6 +14,7 @@ from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend
+from warmprior.envs import NavigationEnv
 from warmprior.training import NetworkOptions, Task, TrainingConfig
 from warmprior.training.files import opened
 from warmprior.training.train import new_policy
@@ -169,6 +170,15 @@ def test_joint_targets_beside_images():
     expected = network.trend(data["state"])
     torch.testing.assert_close(target, expected[1])
     assert source.abs().max() < 0.2 < target.abs().max()
+
+
+def test_an_environment_of_other_widths_is_refused_before_a_training():
+    fitting = {"observation": torch.randn(40, 9), "action": torch.rand(40, 1)}
+    Task.of("own", steps(**fitting), NavigationEnv).check_environment()
+    for changed in ({"observation": torch.randn(40, 5)}, {"action": torch.rand(40, 3)}):
+        task = Task.of("own", steps(**fitting | changed), NavigationEnv)
+        with pytest.raises(ValueError, match=rf"of own human cannot be played: its '{next(iter(changed))}'"):
+            task.check_environment()
 
 
 def test_part_of_a_file_is_its_first_demonstrations(path):

@@ -154,6 +154,8 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
     """Open a robomimic file for reading; a ``DatasetError`` if it is not whole or has no demos."""
     h5py = require("h5py", "sim")
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name a file, or a LeRobotDataset as lerobot:{path}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; check the path")
     try:
@@ -255,8 +257,8 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
         if dataset is None and key == "rewards":  # which cloning does not need
             continue
         if dataset is None:
-            others = [*names(demo), *(f"obs/{name}" for name in names(observations))]
-            raise unknown(what, "dataset", key, others)
+            kind, found = ("observation", observations) if key.startswith("obs/") else ("dataset", demo)
+            raise unknown(what, kind, key.removeprefix("obs/"), names(found))
         shape: tuple[int, ...] = dataset.shape or ()
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0 or shape[:1] != (steps,):
@@ -286,6 +288,11 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
         what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
         if images is None:
             others = [name for name in names(demo["obs"]) if name.endswith("_image") and name != key]
+            if not others:
+                raise DatasetError(
+                    f"{_place(demo)} has no images: leave image_keys out, or render them of its states "
+                    "(python benchmarks/demonstrations.py render)"
+                )
             raise unknown(_place(demo), "images", key, others)
         shape: tuple[int, ...] = images.shape or ()
         side = shape[1] if len(shape) == 4 else 0
@@ -356,9 +363,10 @@ def read_index(
                 raise DatasetError(f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'")
             for key, width in expected.items():
                 if widths[key] != width:
+                    leave = "" if key == "actions" else ", or choose observation_keys"
                     raise DatasetError(
                         f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. Use "
-                        "demos of one environment and controller, or choose observation_keys."
+                        f"demos of one environment and controller{leave}."
                     )
             expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
             lengths.append(steps)

@@ -208,6 +208,11 @@ def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
     return sorted(set(numbers))
 
 
+def image_key(feature: str) -> str:
+    """What a camera's feature is called here: ``observation.images.front`` is ``front_image``."""
+    return f"{feature.rpartition('.')[2]}_image"
+
+
 def action_names(arms: int) -> list[str]:
     """Return what a dataset calls the pose deltas of so many arms of robosuite, such as ``robot0_rx``."""
     return [f"robot{arm}_{name}" for arm in range(arms) for name in _ARM_ACTIONS]
@@ -281,12 +286,9 @@ def read_lerobot_index(
                 "observations are vectors of numbers: leave it out, or write one that is"
             )
         if key not in columns:
-            raise unknown(root, "observation", key, columns)
-    cameras = {
-        f"{name.rpartition('.')[2]}_image": name
-        for name in metadata.camera_keys
-        if name not in metadata.depth_keys
-    }
+            seen = [name for name in columns if name in named or name.startswith("observation")]
+            raise unknown(root, "observation", key, seen)
+    cameras = {image_key(name): name for name in metadata.camera_keys if name not in metadata.depth_keys}
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     count = len(rows)
     if episodes is not None:

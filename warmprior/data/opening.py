@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5 import read_index
 from warmprior.data.lerobot import LeRobotDemonstrations
-from warmprior.data.lerobot_index import read_lerobot_index
+from warmprior.data.lerobot_index import image_key, read_lerobot_index
 from warmprior.data.minari import MinariDemonstrations, minari_environment, read_minari_index
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.data.robomimic import RobomimicDemonstrations
@@ -63,6 +63,10 @@ class Demonstrations:
             self._options["env_args"] = env_args
         name = Path(place).name if self._prefix is None else f"{self._prefix}{name_of_place(place)}"
         self.name = name if mask is None else f"{name} (mask {mask})"
+
+    def image_keys(self, names: Sequence[str]) -> list[str]:
+        """Names of images as policies have them; LeRobot's own, ``observation.images.front``, are known."""
+        return [image_key(name) if name.startswith("observation.") else name for name in names]
 
     def index(self, **options: Any) -> DatasetIndex:
         """What is there; options (``image_keys``, ``demos`` and so on) as of ``read_index``."""

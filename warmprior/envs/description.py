@@ -96,8 +96,11 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Ca
     elif _is_complete(description):
         make_env, adapters = robosuite_parts(description)
     else:
-        what = f"no description of an environment of robosuite or Gymnasium, but {description}"
-        raise ValueError(f"the policy keeps {what}: build yours with policy_transforms(actor)")
+        kept = "" if description is None else f" (it keeps {description})"
+        raise ValueError(
+            f"the policy keeps no description of an environment of robosuite or Gymnasium{kept}: it was "
+            "trained on demonstrations alone. Build your environment with policy_transforms(actor)"
+        )
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(
         policy_transforms,
@@ -127,7 +130,7 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
         Traceback (most recent call last):
             ...
-        ValueError: the policy keeps no description of an environment of robosuite or Gymnasium, but None...
+        ValueError: the policy keeps no description of an environment of robosuite or Gymnasium: ...
     """
     make_env, make_transforms = environment_parts(actor)
     return TransformedEnv(make_env(**options), make_transforms(), auto_unwrap=False)

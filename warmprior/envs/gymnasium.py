@@ -123,7 +123,8 @@ def registered_env(
         horizon: steps per episode, in place of ``"max_episode_steps"``.
 
     Raises:
-        ValueError: if there is no such environment, or it has wrappers, which would be imported.
+        ImportError: if no environment of this name is registered.
+        ValueError: if it has wrappers, which would be imported.
 
     Examples:
         >>> from warmprior.envs import registered_env
@@ -137,7 +138,7 @@ def registered_env(
         if find_spec(package) is not None:
             importlib.import_module(package)
     if name not in gymnasium.registry:
-        raise ValueError(
+        raise ImportError(
             f"Gymnasium has no environment {name!r}: install the package that registers it, and import that "
             "before (gymnasium-robotics: pip install --no-deps gymnasium-robotics pettingzoo imageio)"
         )

@@ -68,10 +68,14 @@ def check_identity(path: Path, theirs: Any, mine: Mapping[str, Any]) -> None:
     """Refuse a state that belongs to another training, naming the first part that differs."""
     theirs = theirs if isinstance(theirs, dict) else {}
     for part, value in as_json(mine).items():
-        if theirs.get(part) != value:
+        found = theirs.get(part)
+        if found != value:
+            if isinstance(found, dict) and isinstance(value, dict):  # what differs alone
+                keys = [key for key in {**found, **value} if found.get(key) != value.get(key)]
+                found, value = ({key: each.get(key) for key in keys} for each in (found, value))
             raise ValueError(
-                f"{path} belongs to another {part}: it has {theirs.get(part)}, this run has {value}. Use "
-                "the same options, or another output folder."
+                f"{path} belongs to another {part}: it has {found}, this run has {value}. Use the same "
+                "options, or another output folder."
             )
 
 

@@ -82,7 +82,11 @@ def _folder(place: str | Path, *, revision: str | None = None, token: str | None
     hub = require("huggingface_hub", "sim")
     fetch = partial(hub.snapshot_download, place, token=token)
     # The small file first: a repository of something else may be large.
-    folder = Path(fetch(revision=revision, allow_patterns=[CONFIG]))
+    try:
+        folder = Path(fetch(revision=revision, allow_patterns=[CONFIG]))
+    except OSError as error:
+        said = " ".join(str(error).split())
+        raise OSError(f"{place} is no folder here, and the hub does not give it: {said}") from error
     if not (folder / CONFIG).exists():
         raise ValueError(f"{place} at the hub holds no policy of warmprior: it has no {CONFIG}")
     _check_format(folder / CONFIG, read_json(folder / CONFIG))
@@ -278,7 +282,7 @@ def load_policy(
     Raises:
         FileNotFoundError: if there is none.
         ValueError: if it is damaged or of another format version; or if a revision of a folder is asked for.
-        OSError: the hub client's own, if the hub does not have it, or does not give it to this user.
+        OSError: if the hub does not have it, or does not give it to this user.
 
     Examples:
         >>> from tempfile import TemporaryDirectory

@@ -17,11 +17,11 @@ from torchrl.envs.transforms import Transform
 
 from warmprior.checks import check_choice, check_keys, check_whole_numbers
 from warmprior.io.files import digest_of
-from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
+from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.preconditioning import VARIANCE_FLOOR, RestingAction, RestingJoints
-from warmprior.modules.prior import Prior
+from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
 
@@ -191,7 +191,8 @@ class Task:
             joint_key: of these the one that actions are absolute targets of, number by number, such as the
                 positions of joints; actions beyond its width are none (see :meth:`with_joints`).
             image_keys: images that policies see, beside the state of the robot, such as
-                ``"agentview_image"``; none by default.
+                ``"agentview_image"``; of a LeRobotDataset ``"front_image"`` is
+                ``"observation.images.front"``. None by default.
             fast_rendering: whether the images are without reflections, shadows and smooth edges.
             mask: a mask of the file, such as ``"train"``.
             demos: how many to take, from the first on; all by default.
@@ -217,6 +218,7 @@ class Task:
         from warmprior.training import files
 
         found = files.opened(place, task, mask)
+        image_keys = found.image_keys(image_keys)
         index = found.index(observation_keys=observation_keys)
         if make_env is not None or not index.env_args:
             storage = "memmap" if image_keys else "memory"
@@ -339,6 +341,47 @@ class Task:
         )
         # An environment may have transforms of its own; they stay inside.
         return TransformedEnv(base or self.make_env(**options), transforms, auto_unwrap=False)
+
+    def check_environment(self, **options: Any) -> None:
+        """Build the environment, reset it and step once with a recorded action; nothing is trained.
+
+        Args:
+            **options: of ``make_env``.
+
+        Raises:
+            ImportError: if the environment is not installed.
+            ValueError: if it cannot be played, or is not that of the demonstrations.
+        """
+        env: EnvBase | None = None
+        try:
+            env = base = self.make_env(**options)
+            env = self.env(GaussianPrior(1), base)
+            known = list(base.observation_spec.keys(True, True))
+            for key in (self.success, *self.measures):
+                if key not in known:
+                    raise ValueError(f"it does not write {key!r} beside its reward: it writes {known}")
+            widths = {"observation": self.vector.shape[-1], "action": self.data[ACTION].shape[-1]}
+            specs = {"observation": base.observation_spec, "action": env.full_action_spec}
+            for (name, width), place in zip(widths.items(), (OBSERVATION, CHUNK), strict=True):
+                spec = specs[name]
+                theirs = spec[place].shape[-1:] if place in spec.keys(True, True) else None
+                if theirs != (width,):
+                    raise ValueError(
+                        f"its {name!r} has the width {theirs}, and that of its demonstrations {width}"
+                    )
+            env.set_seed(0)
+            env.step(env.reset().set(CHUNK, self.data[ACTION][:1].to("cpu")))
+        except ImportError:
+            raise
+        except Exception as error:  # of a simulator, or of code of a user's
+            reason = error.args[0] if isinstance(error, KeyError) and error.args else error
+            file = f" ({self.facts['file']})" if "file" in self.facts else ""
+            raise ValueError(
+                f"the environment of {self.name} {self.style}{file} cannot be played: {reason}"
+            ) from error
+        finally:
+            if env is not None:
+                env.close()
 
     def split(self, held_out: int) -> tuple[Self, TensorDictBase | None]:
         """The task without its last demonstrations, and their normalised steps; units are those of all.
