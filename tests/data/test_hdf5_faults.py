@@ -91,7 +91,7 @@ FAULTS = {
     "no data": (lambda f, folder: f.move("data", "elsewhere"), ["no group 'data'", "elsewhere"]),
     "no demos": (_no_demos, ["no demos"]),
     "other name": (lambda f, folder: f.move("data/demo_1", "data/second"), ["data/second", "rename"]),
-    "no key": (without("obs/object"), ["data/demo_1", "obs/object", "robot0_eef_pos"]),
+    "no key": (without("obs/object"), ["data/demo_1", "'object'", "robot0_eef_pos"]),
     "short object": (replaced("obs/object", np.zeros((4, 14))), [OBJECT, "(4, 14)", "5 rows", "mask"]),
     "wide actions": (
         replaced("actions", np.zeros((5, 8))),
