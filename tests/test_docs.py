@@ -157,6 +157,11 @@ def test_the_table_of_results_is_that_of_the_stored_numbers():
     assert results.table() in results.PAGE.read_text()
     assert results.human_table() in (DOCS / "evidence.md").read_text()
     assert results.paper_table() in (DOCS / "paper.md").read_text()
+    notes = (DOCS / "evidence.md").read_text()
+    shown = {name for name, _ in results.PLAYED.findall(notes)}
+    assert shown == {path.stem for path in results.DATA.glob("*.jsonl")}
+    for found in results.PLAYED.finditer(notes):
+        assert found[0] == f"{found[1]}{found[2]}{results.played_table(found[1])}"
     shown = set(re.findall(r"\(_static/results/(\w+)\.png\)", results.PAGE.read_text()))
     assert shown == {path.stem for path in results.OUT.glob("*.png")}
     for file in results.DATA.glob("*.csv"):

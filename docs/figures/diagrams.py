@@ -14,10 +14,10 @@ from matplotlib.patches import Rectangle
 OUT = Path(__file__).parents[1] / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 QUESTIONS = (
-    ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior,\nsmall sigma", BLUE),
-    ("Are actions absolute arm poses?", "GaussianPrior", GREY),
-    ("Nine steps, many demonstrations?", "GaussianPrior", GREY),
-    ("At most 25 demonstrations?", "PastPrior or\nPreviewPrior", BLUE),
+    ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=1", BLUE),
+    ("Are actions absolute poses\nof the hand?", "GaussianPrior(8), nfe=1", GREY),
+    ("At most 25 demonstrations\nby a script or an expert?", "PastPrior(8), nfe=1", BLUE),
+    ("More than 100 by people, and time\nfor nine evaluations per chunk?", "GaussianPrior(8), nfe=9", GREY),
 )
 
 
@@ -41,14 +41,14 @@ def box(
 
 def flowchart() -> None:
     """Chart H: which source to take."""
-    made, axis = canvas(6.0, 5.2)
-    left, right, step, top = 17.0, 48.5, 10.2, 46.0
+    made, axis = canvas(6.4, 5.2)
+    left, right, step, top = 17.0, 51.0, 10.2, 46.0
     for k, (question, answer, color) in enumerate(QUESTIONS):
         y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
-        box(axis, (right, y), (20, 6.4), answer, fc=color, ec=color, color="white")
+        box(axis, (right, y), (23, 6.4), answer, fc=color, ec=color, color="white")
         arrow = {"arrowstyle": "-|>", "color": "0.3"}
-        axis.annotate("", (right - 10, y), (left + 15, y), arrowprops=arrow)
+        axis.annotate("", (right - 11.5, y), (left + 15, y), arrowprops=arrow)
         axis.annotate("", (left, y - step + 3.2), (left, y - 3.2), arrowprops=arrow)
         axis.text(left + 16, y + 0.6, "yes", fontsize=10)
         axis.text(left + 0.8, y - step / 2 - 0.8, "no", fontsize=10)
@@ -56,7 +56,7 @@ def flowchart() -> None:
         axis,
         (left, top - step * len(QUESTIONS)),
         (30, 6.4),
-        "PastPrior(8, correlation=0.5)",
+        "PastPrior(8, correlation=0.5),\nnfe=3",
         fc=BLUE,
         ec=BLUE,
         color="white",

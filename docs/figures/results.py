@@ -365,6 +365,41 @@ def paper_table() -> str:
     return "\n".join(text) + "\n"
 
 
+def played_table(name: str) -> str:
+    """Success of the rows of a run, in Markdown: percent, and episodes won and lost of the Gaussian source's.
+
+    A line per NFE and factor of the source's noise; seeds are taken together.
+    """
+    rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
+    rows["source"] = [
+        ",".join(filter(None, pair)) for pair in zip(rows["prior"], rows["options"], strict=True)
+    ]
+    names = [source for source in SOURCES if source in set(rows["source"])]
+    text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
+    text.append("|---" * (2 + len(names)) + "|")
+    if "temperature" not in rows:
+        rows["temperature"] = 1.0
+    for (nfe, noise), part in rows.sort_values(["nfe", "temperature"], ascending=False).groupby(
+        ["nfe", "temperature"], sort=False
+    ):
+        rates = part.groupby("source")["successes"].sum() / part.groupby("source")["episodes"].sum()
+        outcomes = part.sort_values("seed").groupby("source")["outcomes"].sum()
+        cells = []
+        for source in names:
+            rate = "" if source not in rates else f"{100 * rates[source] + 1e-6:.0f}"
+            rate = f"**{rate}**" if rate and rates[source] == rates.max() else rate
+            if rate and source != GAUSSIAN and len(outcomes[source]) == len(outcomes[GAUSSIAN]):
+                pairs = list(zip(outcomes[source], outcomes[GAUSSIAN], strict=True))
+                rate += f" ({pairs.count(('1', '0'))} : {pairs.count(('0', '1'))})"
+            cells.append(rate)
+        text.append(f"| {nfe} | {noise:g} | " + " | ".join(cells) + " |")
+    return "\n".join(text) + "\n"
+
+
+PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+"""Where a page has the table of a run's rows."""
+
+
 def main() -> None:
     """Draw the charts, and write the tables into the pages."""
     OUT.mkdir(parents=True, exist_ok=True)
@@ -373,7 +408,8 @@ def main() -> None:
     marked = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
     pages = {PAGE: table(), DOCS / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
     for page, text in pages.items():
-        page.write_text(marked.sub(text, page.read_text()))
+        text = marked.sub(text, page.read_text())
+        page.write_text(PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", text))
 
 
 if __name__ == "__main__":
