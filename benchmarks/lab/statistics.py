@@ -36,6 +36,25 @@ def probability_better(successes_a: float, episodes_a: int, successes_b: float, 
     return float(np.clip(np.trapezoid(b.cdf(GRID) * a.pdf(GRID), GRID), 0.0, 1.0))
 
 
+def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
+    """Return the episodes of the best setting, which is chosen on other episodes than those it is counted on.
+
+    Of outcomes ``[settings, episodes]`` the even episodes choose for the odd ones and the odd for the even
+    ones; among equals the first setting is chosen. So no setting is better for having been chosen.
+
+    Examples:
+        >>> import numpy as np
+        >>> from lab.statistics import chosen_elsewhere
+        >>> # The first setting solves even episodes alone: they choose it, and it fails on the odd ones.
+        >>> chosen_elsewhere(np.array([[1, 0, 1, 0], [0, 1, 0, 1]])).tolist()
+        [0, 0, 0, 0]
+    """
+    chosen = np.empty_like(solved[0])
+    for part, other in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
+        chosen[part] = solved[solved[:, other].mean(1).argmax(), part]
+    return chosen
+
+
 def paired_probability_better(wins: float, losses: float) -> float:
     r"""Return the posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
 

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat, read_csv, read_json
 
 from lab.paper import PAPER_DEFAULT_SIGMA, PAPER_SUCCESS, STATE
+from lab.statistics import chosen_elsewhere
 
 DOCS = Path(__file__).parents[1]
 DATA, OUT, PAGE = DOCS / "results", DOCS / "_static" / "results", DOCS / "results.md"
@@ -368,32 +369,48 @@ def paper_table() -> str:
 def played_table(name: str) -> str:
     """Success of the rows of a run, in Markdown: percent, and episodes won and lost of the Gaussian source's.
 
-    A line per NFE and factor of the source's noise; seeds are taken together.
+    A line per NFE and factor of the source's noise, and per NFE one in which every source has its own best
+    factor, chosen on other episodes. Seeds are taken together.
     """
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     rows["source"] = [
         ",".join(filter(None, pair)) for pair in zip(rows["prior"], rows["options"], strict=True)
     ]
+    rows["noise"] = rows.get("temperature", Series(1.0, rows.index))
+    rows["solved"] = [np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]]
     names = [source for source in SOURCES if source in set(rows["source"])]
     text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
     text.append("|---" * (2 + len(names)) + "|")
-    if "temperature" not in rows:
-        rows["temperature"] = 1.0
-    for (nfe, noise), part in rows.sort_values(["nfe", "temperature"], ascending=False).groupby(
-        ["nfe", "temperature"], sort=False
-    ):
-        rates = part.groupby("source")["successes"].sum() / part.groupby("source")["episodes"].sum()
-        outcomes = part.sort_values("seed").groupby("source")["outcomes"].sum()
-        cells = []
-        for source in names:
-            rate = "" if source not in rates else f"{100 * rates[source] + 1e-6:.0f}"
-            rate = f"**{rate}**" if rate and rates[source] == rates.max() else rate
-            if rate and source != GAUSSIAN and len(outcomes[source]) == len(outcomes[GAUSSIAN]):
-                pairs = list(zip(outcomes[source], outcomes[GAUSSIAN], strict=True))
-                rate += f" ({pairs.count(('1', '0'))} : {pairs.count(('0', '1'))})"
-            cells.append(rate)
-        text.append(f"| {nfe} | {noise:g} | " + " | ".join(cells) + " |")
+    for nfe, part in rows.sort_values(["nfe", "noise"], ascending=False).groupby("nfe", sort=False):
+        solved = {
+            (noise, source): np.concatenate(list(group.sort_values("seed")["solved"]))
+            for (noise, source), group in part.groupby(["noise", "source"], sort=False)
+        }
+        noises = list(dict.fromkeys(noise for noise, _ in solved))
+        text += [
+            _played_line(nfe, f"{n:g}", {s: solved[n, s] for s in names if (n, s) in solved}, names)
+            for n in noises
+        ]
+        if len(noises) > 1:
+            every = {s: [solved[n, s] for n in noises if (n, s) in solved] for s in names}
+            best = {s: chosen_elsewhere(np.stack(e)) for s, e in every.items() if len(e) == len(noises)}
+            text.append(_played_line(nfe, "own best", best, names))
     return "\n".join(text) + "\n"
+
+
+def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: list[str]) -> str:
+    most, base, cells = max(each.mean() for each in solved.values()), solved.get(GAUSSIAN), []
+    for source in names:
+        mine = solved.get(source)
+        if mine is None:
+            cells.append("")
+            continue
+        rate = f"{100 * mine.mean() + 1e-6:.0f}"
+        rate = f"**{rate}**" if mine.mean() == most else rate
+        if source != GAUSSIAN and base is not None and len(mine) == len(base):
+            rate += f" ({(mine > base).sum()} : {(mine < base).sum()})"
+        cells.append(rate)
+    return f"| {nfe} | {noise} | " + " | ".join(cells) + " |"
 
 
 PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from lab.statistics import (
     bootstrap_ratio,
+    chosen_elsewhere,
     paired_probability_better,
     probability_better,
 )
@@ -64,3 +66,15 @@ def test_paired_probability_is_that_of_a_beta(wins, losses):
     assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
     with pytest.raises(ValueError, match="between 0"):
         paired_probability_better(-1, losses)
+
+
+def test_what_is_chosen_elsewhere_gains_nothing_by_chance():
+    """Of settings that are equally good, the best of all episodes looks better; the chosen one does not."""
+    rng = np.random.default_rng(0)
+    solved = (rng.random((2_000, 3, 50)) < 0.5).astype(int)
+    chosen = np.array([chosen_elsewhere(each).mean() for each in solved])
+    assert solved.mean(2).max(1).mean() > 0.54
+    assert abs(chosen.mean() - 0.5) < 0.006  # four standard errors
+    # A setting that is better is found.
+    better = (rng.random((2_000, 3, 50)) < np.array([0.2, 0.8, 0.2])[:, None]).astype(int)
+    assert abs(np.mean([chosen_elsewhere(each).mean() for each in better]) - 0.8) < 0.006
