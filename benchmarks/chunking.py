@@ -16,7 +16,7 @@ from lab.options import PRESETS, check_single, parse, script, started, with_part
 from lab.paper import PAPER_CHUNK
 from lab.plots import plot_bars, plot_lines, plot_success
 from lab.policies import policies_of, slug
-from lab.report import labelled, per_seed, table, write_report
+from lab.report import at_fewest, labelled, per_seed, table, write_report
 
 JUMPS = ("boundary_jump", "inner_jump")
 
@@ -39,7 +39,7 @@ def main(argv: list[str] | None) -> None:
             end = f"_{slug(name)}" if len(problems) > 1 else ""
             plot_lines(mine, out / f"chunk_lengths{end}.png", name, "chunk", lines)
         # All tasks beside each other, at the fewest network evaluations.
-        fewest, shortest = seeds[seeds.nfe == min(seeds.nfe)], min(seeds.chunk)
+        fewest, shortest = at_fewest(seeds), min(seeds.chunk)
         title = f"NFE {min(seeds.nfe)}, {options.evaluation.seeds} seed(s)"
         pair = fewest[fewest.chunk.isin((shortest, PAPER_CHUNK))]
         bars = {"success": "success rate"}

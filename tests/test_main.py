@@ -173,7 +173,7 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     # Its actions are not near the arm; and of what it has, observations alone are named.
-    for more, message in (("--joint-key arm", "action 0 of cups"), ("--observation-keys leg", "leg")):
+    for more, message in (("--joint-key arm", "actions of cups"), ("--observation-keys leg", "leg")):
         assert main([*words.split(), *more.split(), "--out", str(tmp_path / "out")]) == 2
         said = capsys.readouterr().err
         assert message in said and "timestamp" not in said

@@ -263,7 +263,8 @@ def convert(args: argparse.Namespace) -> None:
     """Write a robomimic HDF5 file as a LeRobotDataset v3."""
     from warmprior.data import convert_robomimic
 
-    print(convert_robomimic(args.file, args.folder, images=args.images, demos=args.demonstrations))
+    chosen = {"demos": args.demonstrations, "observation_keys": args.observation_keys}
+    print(convert_robomimic(args.file, args.folder, images=args.images, **chosen))
 
 
 def observe(args: argparse.Namespace) -> None:
@@ -334,6 +335,7 @@ def make_parser() -> argparse.ArgumentParser:
     kept = {"action": "store_const", "dest": "images"}
     add("--images", **kept, const="image", help="with those of the file, as lossless pictures")
     add("--video", **kept, const="video", help="with those of the file, as videos: lossy, smaller")
+    add("--observation-keys", nargs="+", help="which observations to write (default: the task's)")
     add("--demonstrations", type=int, help="how many, from the first on (default: all)")
 
     add = command(observe)

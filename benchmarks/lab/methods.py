@@ -278,6 +278,11 @@ class Method:
         return not self.parts.played
 
     @property
+    def is_regression(self) -> bool:
+        """Whether the field is trained at ``t = 0`` alone."""
+        return self.parts.prior is PointPrior
+
+    @property
     def is_straight(self) -> bool:
         """Whether its path is the straight line, on which a velocity predicts the sample."""
         return self.parts.coupling is not bridge
@@ -319,8 +324,9 @@ class Method:
         return [self.parts.played["temperature"]] if "temperature" in self.parts.played else asked
 
     def recipe(self, training: TrainingConfig) -> TrainingConfig:
-        """The recipe for this method: a regression has t = 0 alone, and no history is withheld in vain."""
-        own: dict[str, Any] = {"times": "start"} if self.parts.prior is PointPrior else {}
+        """The recipe of this method: no history is withheld in vain; what is no flow has its own times."""
+        times = "start" if self.is_regression else "uniform"  # which a coupling's own replace
+        own: dict[str, Any] = {} if self.is_flow else {"times": times}
         return replace(training, **own | ({} if self.remembers else {"cold_probability": 0.0}))
 
     def prior(self, widths: Sequence[int] = ()) -> Prior:

@@ -184,7 +184,7 @@ class Options:
         if self.training.weighting == "standardised" and not self.network.precondition:
             raise ValueError("--no-precondition needs --weighting velocity")
         for method in self.sources.methods():
-            if method.is_flow and self.training.times == "start":
+            if self.training.times == "start" and not method.is_regression:
                 raise ValueError(f"--times start trains no flow: leave out {method.name}, or take regression")
             l1, distilled = self.training.objective == "l1", self.training.self_distillation > 0
             if distilled and not method.is_flow:

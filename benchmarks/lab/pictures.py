@@ -12,7 +12,7 @@ import pandas as pd
 from lab.options import Options
 from lab.plots import plot_filmstrip, plot_learning_curves, plot_success
 from lab.policies import Policy
-from lab.report import labelled, per_seed
+from lab.report import at_fewest, labelled, per_seed
 from lab.tasks import title_of
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
@@ -41,8 +41,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         losses: dict[str, list[list[tuple[int, float]]]] = {}
         for policy in played:
             losses.setdefault(label[policy.name], []).append(policy.losses)
-        each = mine.groupby("method")  # of every method, which may have an NFE of its own
-        fewest = mine[mine.nfe == each.nfe.transform("min")]
+        fewest = at_fewest(mine)
         fewest = fewest[fewest.temperature == fewest.groupby("method").temperature.transform("max")]
         plot_learning_curves(losses, fewest, out / f"learning_curves{end}.png", title=title)
         task = played[0].task()

@@ -93,7 +93,8 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """The policy of averaged weights, on the CPU, as it is played here."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
-        return load_policy(path).replace(**{"grid": self.grid, **self.method.parts.played})
+        policy = load_policy(path)
+        return policy.replace(grid=self.grid) if self.method.is_flow else policy
 
     @property
     def losses(self) -> list[tuple[int, float]]:
@@ -219,6 +220,7 @@ def train(policy: Policy) -> None:
             coupling=method.coupling(teacher.load().to(device) if teacher else None),
             see_history=method.parts.sees_history,
             max_nfe=method.parts.played.get("nfe"),
+            **method.parts.played,
             device=device,
             compile=policy.run.compile,
             logger=logger,

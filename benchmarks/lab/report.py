@@ -101,6 +101,11 @@ def _of_best(group: DataFrame, top_k: int) -> Series:
     return last
 
 
+def at_fewest(rows: DataFrame) -> DataFrame:
+    """The rows at the fewest network evaluations of every method, which may have a number of its own."""
+    return rows[rows["nfe"] == rows.groupby("method")["nfe"].transform("min")]
+
+
 def pooled(rows: DataFrame) -> DataFrame:
     """Curvatures averaged over the training seeds, or those of the only seed."""
     average = rows["seed"].isna()
@@ -223,7 +228,7 @@ def _placed(found: DataFrame) -> DataFrame:
     """A summary with the `place` where methods compare, and the `text` of a success with its gain."""
     delay = ", delay " + found["delay"].astype(str) if "delay" in found else ""
     found = found.assign(place=found["problem"] + delay, column="NFE " + found["nfe"].astype(str))
-    if found.get("temperature", Series([1.0])).nunique() > 1:
+    if "temperature" in found and found.groupby("method")["temperature"].nunique().max() > 1:
         found["column"] += ", noise x " + found["temperature"].map("{:g}".format)
     best = found.groupby(["place", "column"])["success"].transform("max")
     texts = []

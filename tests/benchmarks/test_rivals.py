@@ -92,9 +92,14 @@ def test_mip_learns(precondition):
         network=NetworkOptions(hidden_dim=32, observation_steps=1, precondition=precondition),
         training=TrainingConfig(iterations=800, weighting=None if precondition else "velocity"),
         coupling=method.coupling(),
-        max_nfe=2,
+        **method.parts.played,
         description=None,
-    ).replace(**method.parts.played)
+    )
+    assert (actor.sampling.evaluations(), actor.sampling.grid, actor.sampling.temperature) == (
+        2,
+        "dense-jump:0.9",
+        0,
+    )
     seen = torch.tensor([[-0.8], [0.0], [0.8]])
     units = actor.normalizer
     normalised = units.normalize(TensorDict({"observation": seen}, [3]))["observation"].unsqueeze(1)

@@ -151,10 +151,10 @@ def test_nothing_named_in_a_dataset_is_imported(root):
     name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
     (metadata,) = root.rglob("metadata.json")
     text = metadata.read_text()
-    for there, other in (("Pendulum-v1", "evil-v1"), ("Pendulum-v1", "evil:Pendulum-v1")):
-        metadata.write_text(text.replace(there, other))
+    for other in ("evil-v1", "evil:Pendulum-v1"):
+        metadata.write_text(text.replace("Pendulum-v1", other))
         task = Task.open(f"minari:{name}")
-        with pytest.raises((ImportError, ValueError), match=other):
+        with pytest.raises(ImportError, match=other):
             task.make_env()
     entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
     assert entry in text

@@ -19,7 +19,7 @@ from lab.scripted.tasks import EXPERTS
 from tests.data.synthetic import env_args_14
 from tests.processes import apart
 from warmprior.envs import RobosuiteEnv, rendering_backend
-from warmprior.envs.simulator import task_env_args
+from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)
@@ -64,6 +64,26 @@ def test_objects_are_where_they_are_whatever_else_is_observed(loop):
     torch.testing.assert_close(play(alone, actions), play(whole, actions)[:, :14])
     whole.close()
     alone.close()
+
+
+@pytest.mark.parametrize(
+    ("robot", "controller", "expected"),
+    [
+        ("Panda", {"type": "OSC_POSE"}, [2.0] * 3 + [np.pi] * 3),
+        ("Panda", {"type": "OSC_POSITION"}, [2.0] * 3),
+        ("Panda", {"type": "OSC_POSE", "impedance_mode": "variable_kp"}, [1.0] * 6 + [2.0] * 3 + [np.pi] * 3),
+        # Every other joint of this arm turns without end.
+        ("Kinova3", {"type": "JOINT_POSITION"}, [np.pi, 2.41, np.pi, 2.66, np.pi, 2.23, np.pi]),
+    ],
+)
+def test_absolute_targets_have_the_width_of_the_simulator(robot, controller, expected):
+    env_args = task_env_args("lift")
+    env_args["env_kwargs"]["robots"] = [robot]
+    parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
+    parts["right"] = parts["right"] | controller | {"input_type": "absolute"}
+    env = make_simulator(env_args)
+    assert action_limits(env) == pytest.approx([*expected, *[1.0] * (env.action_dim - len(expected))])
+    env.close()
 
 
 def test_absolute_joint_targets():

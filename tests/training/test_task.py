@@ -13,9 +13,10 @@ from tensordict import TensorDict
 from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.toy_env import CountingEnv
-from warmprior import GaussianPrior, PoseTrend
+from warmprior import GaussianPrior, PastPrior, PoseTrend, RestingJoints
 from warmprior.envs import NavigationEnv
-from warmprior.training import NetworkOptions, Task, TrainingConfig
+from warmprior.history import cold_history
+from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, save_policy
 from warmprior.training.files import opened
 from warmprior.training.train import new_policy
 from warmprior.transforms import AbsoluteActions
@@ -150,12 +151,55 @@ def test_joint_targets_are_learnt_from_where_the_joints_are():
 
 @pytest.mark.parametrize(
     ("columns", "said"),
-    [([1, 2, -1], "action 0 of arm .* number 1"), ([2, 1], "3 numbers"), ([2, 3, -1], "from -1 to 2")],
+    [
+        ([1, 2, -1], r"action [01] least \(number [12] of"),
+        ([0, 1, -1], r"action 0 least \(number 0 of"),
+        ([2, 1], "3 numbers"),
+        ([2, 3, -1], "from -1 to 2"),
+        ([-1, -1, -1], "not all of them -1"),
+        ([2, 1.5, -1], "column 1"),
+    ],
 )
 def test_targets_of_something_else_are_refused(columns, said):
     seen, action, _ = joint_steps()
     with pytest.raises(ValueError, match=said):
         Task.of("arm", steps(400, observation=seen, action=action)).with_joints(columns)
+
+
+def test_joints_may_hang_below_their_targets():
+    """And one of them hardly moves."""
+    seen, action, _ = joint_steps()
+    action[:, 0] = seen[:, 2] + 0.5
+    action[:, 1] = seen[:, 1] + 10.0
+    seen, action = (
+        torch.cat([seen, torch.rand(400, 1)], -1),
+        torch.cat([action, torch.full((400, 1), 0.3)], -1),
+    )
+    task = Task.of("arm", steps(400, observation=seen, action=action)).with_joints([2, 1, -1, 3])
+    assert isinstance(task.rest, RestingJoints)
+    for factor in (0.5, 57.3):  # other units
+        other = action * torch.tensor([factor, factor, 1.0, 1.0])
+        with pytest.raises(ValueError, match="in the same order and units"):
+            Task.of("arm", steps(400, observation=seen, action=other)).with_joints([2, 1, -1, -1])
+
+
+def test_a_policy_of_joint_targets_is_saved_whole(tmp_path):
+    seen, action, _ = joint_steps()
+    task = Task.of("arm", steps(400, observation=seen, action=action)).with_joints([2, 1, -1])
+    actor = new_policy(task, PastPrior(4), NetworkOptions(hidden_dim=16), TrainingConfig(), nfe=2).eval()
+    save_policy(actor, tmp_path / "arm")
+    window = {"observation": torch.randn(5, 2, 3), "history": cold_history([5], 4, 4, 3)}
+    chunks = []
+    for policy in (actor, load_policy(tmp_path / "arm")):
+        torch.manual_seed(0)
+        chunks.append(policy(TensorDict(window, [5]).clone())["vla_action", "chunk"])
+    assert torch.equal(*chunks)
+
+
+def test_other_observations_are_another_task(path):
+    keys = ["object", "robot0_eef_pos"]
+    tasks = [Task.open(path, observation_keys=k) for k in (None, keys, keys[::-1])]
+    assert len({task.identity for task in tasks}) == 3
 
 
 def test_joint_targets_beside_images():

@@ -51,7 +51,8 @@ def convert_robomimic(
         images: write those of the file as well, as pictures (``"image"``, lossless PNG) or as videos
             (``"video"``, lossy, smaller).
         demos: how many to convert, the first ones by their numbers; all if ``None``.
-        observation_keys: the observations to write; by default the task's.
+        observation_keys: the observations to write; by default the task's. Others are to be named again when
+            the dataset is opened.
 
     Raises:
         FileNotFoundError: if there is no such file.

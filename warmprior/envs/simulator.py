@@ -156,8 +156,13 @@ def action_limits(env: Any) -> list[float]:
         for part, (first, last) in composite._action_split_indexes.items():
             controller = composite.part_controllers.get(part)
             if getattr(controller, "input_type", "delta") == "absolute":
-                joints = np.abs(env.sim.model.jnt_range[controller.joint_index]).max(-1)
-                target = joints if controller.name == "JOINT_POSITION" else [2.0] * 3 + [np.pi] * 3
-                magnitudes[first:last] = target
+                target = [2.0] * 3 + [np.pi] * 3
+                if controller.name == "JOINT_POSITION":
+                    ranges = env.sim.model.jnt_range[controller.joint_index]
+                    limited = env.sim.model.jnt_limited[controller.joint_index]
+                    target = np.where(limited, np.abs(ranges).max(-1), np.pi).tolist()
+                # Positions stand first, or gains before them.
+                target = target[: last - first]
+                magnitudes[last - len(target) : last] = target
         limits += magnitudes.tolist()
     return limits

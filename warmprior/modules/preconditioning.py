@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.checks import check_positions
+from warmprior.checks import check_choice, check_positions
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
@@ -81,12 +81,10 @@ class RestingAction(nn.Module):
     @staticmethod
     def zero(kind: str, count: int) -> RestingAction:
         """One of a kind, to be replaced by loading a state dict."""
-        made: dict[str, tuple[type[RestingPose | RestingJoints], tuple[int, ...]]] = {
-            "pose": (RestingPose, (count, _POSE)),
-            "joints": (RestingJoints, (count,)),
-        }
-        kinds, shape = made[kind]
-        return kinds(torch.zeros(shape, dtype=torch.int64))
+        check_choice("the kind of a resting action", kind, ("pose", "joints"))
+        if kind == "pose":
+            return RestingPose(torch.zeros(count, _POSE, dtype=torch.int64))
+        return RestingJoints(torch.zeros(count, dtype=torch.int64))
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable arguments of :meth:`zero`."""

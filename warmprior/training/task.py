@@ -25,8 +25,8 @@ from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
 
-NEAR = 0.5
-"""Share of an action's variance that its distance from what it is a target of may have."""
+NEAR = 0.2
+"""Share of the actions' variance that their distance from what they are targets of may have."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +263,7 @@ class Task:
         # Nothing is said of what is usual.
         space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
         space |= {} if images is None else {"obs": "image", "images": images}
+        space |= {} if observation_keys is None else {"observation_keys": list(observation_keys)}
         facts: dict[str, Any] = {"source": "file", "file": found.name, "sha256": sha256}
         facts |= {"demonstrations": dataset.num_episodes, "steps": len(dataset.data), **space}
         # Images are drawn by what is installed.
@@ -280,7 +281,7 @@ class Task:
                 -1 for an action that is none.
 
         Raises:
-            ValueError: if there is no such number, or an action is not near it.
+            ValueError: if there is no such number, or actions do not follow them.
 
         Examples:
             >>> import torch
@@ -293,20 +294,29 @@ class Task:
             >>> task.rest.columns.tolist()
             [1, 2]
         """
+        columns = list(columns)
         actions, width = self.data[ACTION], self.vector.shape[-1]
         if self.rest is not None or self.normalizer is None:
-            raise ValueError("joints are of actions as they were recorded: leave out actions='absolute'")
-        if len(columns) != actions.shape[-1] or not all(-1 <= column < width for column in columns):
             raise ValueError(
-                f"columns are {actions.shape[-1]} numbers from -1 to {width - 1}, got {list(columns)}"
+                f"{self.name} has a resting action already, or no normaliser: joints are of actions as they "
+                "were recorded (leave out actions='absolute')"
+            )
+        check_whole_numbers(-1, **{f"column {i}": column for i, column in enumerate(columns)})
+        if len(columns) != actions.shape[-1] or not -1 < max(columns) < width:
+            raise ValueError(
+                f"columns are {actions.shape[-1]} numbers from -1 to {width - 1}, not all of them -1: got "
+                f"{columns}"
             )
         rest = RestingJoints(torch.tensor(columns), self.normalizer)
-        off, spread = actions - rest(self.vector), actions - actions.mean(0)
-        far = off.square().mean(0) > NEAR * spread.square().mean(0) + VARIANCE_FLOOR
-        if wrong := [i for i, column in enumerate(columns) if column >= 0 and far[i]]:
+        # Joints may hang below their targets, and a single one may move as little as its noise.
+        targets = torch.tensor([column >= 0 for column in columns])
+        off = (actions - rest(self.vector)).var(0, correction=0)[targets]
+        spread = actions.var(0, correction=0)[targets]
+        if off.sum() > NEAR * spread.sum():
+            worst = int(targets.nonzero()[(off / spread.clamp_min(VARIANCE_FLOOR)).argmax()])
             raise ValueError(
-                f"action {wrong[0]} of {self.name} is not near number {columns[wrong[0]]} of the "
-                "observation: name what actions are targets of, in the same order and units"
+                f"actions of {self.name} are not near what they are to be targets of, action {worst} least "
+                f"(number {columns[worst]} of the observation): name it in the same order and units"
             )
         return replace(self, rest=rest)
 

@@ -41,14 +41,12 @@ def new_policy(
     start: StartPoint | None = None,
     coupling: Coupling | None = None,
     see_history: bool = False,
-    nfe: int | None = None,
-    max_nfe: int | None = None,
+    **sampling: Any,
 ) -> WarmPriorActor:
     """A policy with fresh weights, which depend on the training's seed alone; see :func:`train_policy`."""
     action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
     if see_history:
         observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
-    sampling: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     torch.manual_seed(training.seed)
     velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images)
     if network.precondition:
@@ -66,7 +64,6 @@ def new_policy(
         velocity,
         prior,
         start=start,
-        max_nfe=max_nfe,
         **sampling,
         clip=task.clip,
         observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
@@ -89,12 +86,12 @@ def train_policy(
     start: StartPoint | None = None,
     coupling: Coupling | None = None,
     see_history: bool = False,
-    max_nfe: int | None = None,
     device: str = "cpu",
     compile: bool = False,
     logger: Logger | None = None,
     description: str | None = "train",
     progress: Callable[[int], object] | None = None,
+    **sampling: Any,
 ) -> WarmPriorActor:
     """From demonstrations and a source to a trained policy, by behaviour cloning.
 
@@ -119,12 +116,13 @@ def train_policy(
         start: where samplers start; at the source by default.
         coupling: how sources and targets are paired; as they come by default.
         see_history: whether the network sees the last actions.
-        max_nfe: most network evaluations per chunk, for a field that is trained at ``t = 0`` alone.
         device: of the network and, where they fit, the demonstrations.
         compile: compile the network with :func:`torch.compile`.
         logger: a TorchRL logger, closed at the end.
         description: of the progress bar; no bar if ``None``.
         progress: called with the number of iterations, at the start and after each.
+        **sampling: further options of :class:`~warmprior.Sampling`, saved with the policy, such as
+            ``max_nfe`` for a field that is trained at few times.
 
     Returns:
         The last policy of averaged weights, on the CPU, with the demonstrations' normaliser.
@@ -194,7 +192,7 @@ def train_policy(
             coupling=coupling,
             see_history=see_history,
             nfe=nfe,
-            max_nfe=max_nfe,
+            **sampling,
         )
         cloning = BehaviourCloning(
             actor.to(device),
