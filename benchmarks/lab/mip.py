@@ -19,9 +19,9 @@ class MIPInterpolant(LinearInterpolant):
     Examples:
         >>> import torch
         >>> from lab.mip import MIPInterpolant
-        >>> a0, a1, t = torch.ones(2, 1, 1), torch.full((2, 1, 1), 3.0), torch.tensor([0.0, 0.9])
+        >>> a0, a1, t = torch.ones(2, 1, 1), torch.full((2, 1, 1), 3.0), torch.tensor([0.0, 0.5])
         >>> [end.flatten().tolist() for end in MIPInterpolant()(a0, a1, t)]
-        [[0.0, 2.8...], [3.0, 2.0]]
+        [[0.0, 2.0], [3.0, 2.0]]
     """
 
     name = "mip"
