@@ -168,12 +168,13 @@ def straightness(
     *,
     draws: int = 1,
     seed: int = 0,
+    **options: Any,
 ) -> list[dict[str, Any]]:
     """Curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
 
     Every policy is measured at the history of its training and, if it depends on that, at the one that
     deployment meets, made from its own prediction one decision earlier. A row per policy, training seed and
-    mean, and one with `seed` None for the average over several seeds.
+    mean, and one with `seed` None for the average over several seeds. Options are those of `curvature`.
     """
     policies = {method: actors for method, actors in policies.items() if method.is_flow}
     if not policies:
@@ -194,7 +195,7 @@ def straightness(
             # The same source noise for every policy and mean.
             generator = torch.Generator(device).manual_seed(seed)
             try:
-                values = curvature(actor, batch, draws=draws, generator=generator).cpu()
+                values = curvature(actor, batch, draws=draws, generator=generator, **options).cpu()
             except FloatingPointError as error:
                 raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
             limits = bounds(actor.prior, batch, method.parts.coupling is not None)

@@ -95,7 +95,7 @@ def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(small_loss)
 
     observations = shared(count=None)
     demonstrated = PastPrior(H).distribution(observations.windows(PastPrior(H))["history"]).loc
-    straightness({"past": [policy(field, PastPrior(H, sigma=1.0))]}, observations)
+    straightness({"past": [policy(field, PastPrior(H, sigma=1.0))]}, observations, n_steps=2)
     # At time 0: the earlier prediction, then path and one step at either mean.
     earlier, at_training, at_deployed = starts[0], starts[1], starts[3]
     noise = at_training - demonstrated
@@ -110,10 +110,10 @@ def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(small_loss)
 
 def test_the_bound_is_that_of_the_mean_it_stands_beside(small_loss):
     far = {"past": [policy(lambda t, a, o: torch.full_like(a, 100.0), PastPrior(H))]}
-    rows = straightness(far, shared())
+    rows = straightness(far, shared(), n_steps=4)
     assert rows["past", 0, "deployed"]["bound"] > 1_000 > rows["past", 0, "training"]["bound"]
     # It is no bound of pairs that a coupling has made.
-    rows = straightness({"ot": [policy(turning(1.0))]}, shared())
+    rows = straightness({"ot": [policy(turning(1.0))]}, shared(), n_steps=4)
     assert math.isnan(rows["ot", 0, "training"]["bound"])
 
 
