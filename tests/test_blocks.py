@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
+from warmprior import Prior
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -39,6 +40,9 @@ def files(tmp_path, monkeypatch):
     write_robomimic_file(tmp_path / "square.hdf5", masks={"train": [0, 1]})
     write_robomimic_file(tmp_path / "core" / "coffee_d0.hdf5", [3] * 10, task="coffee_d0")
     monkeypatch.chdir(tmp_path)
+    # What other tests have defined would not be there in a fresh process.
+    own = {n: kind for n, kind in Prior.classes.items() if kind.__module__.startswith(("warmprior.", "lab."))}
+    monkeypatch.setattr(Prior, "classes", own)
 
 
 @pytest.mark.parametrize("text", [each for each in PROGRAMS if TRAINED not in each.values[0]])
