@@ -15,7 +15,7 @@ OUT = Path(__file__).parents[1] / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=1", BLUE),
-    ("Are actions absolute poses\nof the hand?", "GaussianPrior(8), nfe=1", GREY),
+    ("Are actions absolute poses\nor joint targets?", "GaussianPrior(8), nfe=1", GREY),
     ("At most 25 demonstrations\nby a script or an expert?", "PastPrior(8), nfe=1", BLUE),
     ("More than 100 by people, and time\nfor nine evaluations per chunk?", "GaussianPrior(8), nfe=9", GREY),
 )
