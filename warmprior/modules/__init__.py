@@ -7,17 +7,11 @@ from warmprior.modules.mlp import PlainMLP, VelocityMLP
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, Sampling, integrate
-from warmprior.modules.preconditioning import (
-    PoseTrend,
-    PreconditionedNetwork,
-    RestingAction,
-    RestingJoints,
-    RestingPose,
-    SourceMoments,
-)
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.transformers import AdaLNTransformer, ChiTransformer
+from warmprior.modules.trend import PoseTrend, RestingAction, RestingJoints, RestingPose
 
 __all__ = [
     "AdaLNTransformer",

@@ -14,7 +14,7 @@ from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 from warmprior.keys import ACTION, OBSERVATION, STATE
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.preconditioning import RestingPose
+from warmprior.modules.trend import RestingPose
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
 

@@ -24,10 +24,11 @@ from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.preconditioning import RestingAction, SourceMoments
+from warmprior.modules.preconditioning import SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
+from warmprior.modules.trend import RestingAction
 from warmprior.training.checkpoint import load_state, save_state
 
 FORMAT = 7

@@ -20,8 +20,8 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.preconditioning import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.modules.prior import GaussianPrior, Prior
+from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
 

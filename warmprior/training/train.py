@@ -20,8 +20,9 @@ from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
+from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.options import NetworkOptions, TrainingConfig

@@ -1,0 +1,241 @@
+"""The part of absolute actions that follows from where a robot is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from warmprior import keys
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.prior import Prior
+from warmprior.modules.registry import Registered, from_config
+from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
+
+DRAWS = 16
+"""The source is drawn so often per window that the mean has little noise, which belongs to no observation."""
+
+VARIANCE_FLOOR = 1e-4
+"""A standard deviation of 0.01, half a percent of the normalised range; smaller ones count as constant."""
+
+_POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
+
+
+class RestingAction(Registered, nn.Module):
+    """The absolute action that asks a robot to stay where the observation says it is.
+
+    Subclasses say which numbers of the observation are the position of what: :class:`RestingJoints` and
+    :class:`RestingPose`. Called with normalised observations ``[*B, d_o]`` they return normalised actions
+    ``[*B, d_a]``, 0 where an action is no target.
+
+    Args:
+        columns: which numbers of the observation.
+        action_shape: of the actions, ``d_a`` in all.
+        normalizer: of the observations ``[d_o]`` and the actions ``[d_a]``; an identity by default, to be
+            replaced by loading a state dict.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingAction, RestingJoints, RestingPose
+        >>> [issubclass(kind, RestingAction) for kind in (RestingJoints, RestingPose)]
+        [True, True]
+    """
+
+    columns: Tensor
+    loc: Tensor
+    scale: Tensor
+    action_loc: Tensor
+    action_scale: Tensor
+    positive = ("scale", "action_scale")
+
+    def __init__(self, columns: Tensor, action_shape: tuple[int, ...], normalizer: Normalizer | None) -> None:
+        super().__init__()
+        affine = [
+            make(shape) for shape in (columns.shape, action_shape) for make in (torch.zeros, torch.ones)
+        ]
+        if normalizer is not None:
+            ends = normalizer.loc, normalizer.scale
+            vector = next(key for key in normalizer.keys if key != keys.ACTION)
+            affine = [end(vector)[columns] for end in ends]
+            affine += [end(keys.ACTION).reshape(action_shape) for end in ends]
+        self.register_buffer("columns", columns)
+        for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
+            self.register_buffer(name, value.clone())
+
+    @property
+    def width(self) -> int:
+        """``d_a``."""
+        return self.action_loc.numel()
+
+    def config(self) -> dict[str, Any]:
+        """Return name and columns as JSON holds them; the units are buffers."""
+        return {"name": self.name, "columns": self.columns.tolist()}
+
+
+class RestingPose(RestingAction):
+    """The absolute pose at which every gripper stays where the observation says it is.
+
+    Args:
+        columns: ``[arms, 7]``, where in the observation each gripper's position and the
+            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
+        normalizer: see :class:`RestingAction`; of actions ``[10 * arms]``, the grippers' 0.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingPose
+        >>> rest = RestingPose(torch.arange(7)[None])
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+        >>> rest(observation).tolist()[:3], rest(observation).shape
+        ([0.1..., 0.2..., 0.3...], torch.Size([10]))
+    """
+
+    name = "pose"
+
+    def __init__(self, columns: Tensor | list[list[int]], normalizer: Normalizer | None = None) -> None:
+        columns = torch.as_tensor(columns)
+        if columns.ndim != 2 or columns.shape[1] != _POSE:
+            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
+        super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The action ``[*B, 10 * arms]``."""
+        pose = observation[..., self.columns] * self.scale + self.loc
+        hand = quaternion_to_matrix(pose[..., 3:])
+        site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
+        action = torch.cat((pose[..., :3], matrix_to_rotation_6d(site)), -1)
+        normalised = (action - self.action_loc[:, :-1]) / self.action_scale[:, :-1]
+        return pad(normalised, (0, 1)).flatten(-2)
+
+
+class RestingJoints(RestingAction):
+    """The joint targets at which every joint stays where the observation says it is.
+
+    Args:
+        columns: ``[d_a]``, where in the observation the position is that an action is the target of, in
+            the same units; -1 for an action that is no target.
+        normalizer: see :class:`RestingAction`.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingJoints
+        >>> rest = RestingJoints([1, 2, -1])  # two joints and a gripper's command
+        >>> rest(torch.tensor([9.0, 0.5, -0.25])).tolist()
+        [0.5, -0.25, 0.0]
+    """
+
+    name = "joints"
+
+    def __init__(self, columns: Tensor | list[int], normalizer: Normalizer | None = None) -> None:
+        columns = torch.as_tensor(columns)
+        if columns.ndim != 1:
+            raise ValueError(f"columns must be [d_a], got {list(columns.shape)}")
+        super().__init__(columns, (len(columns),), normalizer)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The action ``[*B, d_a]``."""
+        joints = observation[..., self.columns] * self.scale + self.loc
+        return torch.where(self.columns >= 0, (joints - self.action_loc) / self.action_scale, 0.0)
+
+
+class PoseTrend(nn.Module):
+    """Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
+
+    Absolute poses and joint targets lie near the present ones, which explain most of their variance. A
+    network without a trend spends its precision on that, and passes on source noise that is many times as
+    large as the change in one step. With a trend, :class:`~warmprior.PreconditionedNetwork` learns the
+    remainder: where to go from here, as with deltas. Every action dimension is predicted from the same
+    dimension of the resting action at the last observation: a regression on the whole observation fits
+    better, but fails away from the demonstrations.
+
+    Args:
+        rest: the resting action of an observation.
+        centre: ``[d_a]``, its mean.
+        source: ``[P, d_a]``, slopes of :math:`a_0 - E[a_0]`.
+        target: ``[P, d_a]``, slopes of :math:`a_1 - E[a_1]`.
+
+    Raises:
+        ValueError: if the shapes differ, or an entry is NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import PoseTrend, RestingPose
+        >>> rest = RestingPose(torch.arange(7)[None])
+        >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
+        >>> source, target = trend(observation)  # the targets follow the gripper, the source does not
+        >>> source.abs().max(), target[1, 3, :3]
+        (tensor(0.), tensor([0.1000, 0.2000, 0.3000]))
+    """
+
+    centre: Tensor
+    source: Tensor
+    target: Tensor
+
+    def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
+        super().__init__()
+        shapes = [tuple(value.shape) for value in (centre, source, target)]
+        width = rest.width
+        if source.ndim != 2 or shapes != [(width,), (len(source), width), (len(source), width)]:
+            raise ValueError(
+                f"a trend of {width} actions needs [d_a] and twice [P, d_a], got the shapes {shapes}"
+            )
+        self.rest = rest
+        for name, value in (("centre", centre), ("source", source), ("target", target)):
+            if not torch.isfinite(value).all():
+                raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")
+            self.register_buffer(name, value.clone())
+
+    @classmethod
+    def zero(cls, rest: dict[str, Any], prediction_length: int) -> PoseTrend:
+        """No trend, to be replaced by loading a state dict."""
+        made = from_config(RestingAction, rest)
+        none = torch.zeros(prediction_length, made.width)
+        return cls(made, none[0], none, none)
+
+    @classmethod
+    @torch.no_grad()
+    def fit(
+        cls,
+        windows: TensorDictBase,
+        prior: Prior,
+        rest: RestingAction,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> PoseTrend:
+        """Estimate it, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
+
+        The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
+        is of the source samples, on the windows' device.
+        """
+        resting = rest(_vector(windows[keys.OBSERVATION])[:, -1].float()).double()
+        centre = resting.mean(0)
+        source = prior.distribution(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        draws = [source.sample(generator).double() for _ in range(DRAWS)]
+        ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
+        # Padded positions do not count: they would pull the trend to the episode's last action.
+        weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)
+        weight = weight / weight.sum(0).clamp_min(1)
+        deviation = resting.unsqueeze(1) - (weight * resting.unsqueeze(1)).sum(0)
+        variance = (weight * deviation.square()).sum(0)
+        slopes = (weight * deviation * ends).sum(1) / variance.clamp_min(VARIANCE_FLOOR)
+        return cls(rest, centre.float(), *slopes.float())
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable arguments of :meth:`zero`; the values themselves are buffers."""
+        return {"rest": self.rest.config(), "prediction_length": len(self.source)}
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
+
+        Of normalised observations ``[B, To, d_o]`` the last step counts; of images and a state, the state.
+        """
+        deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).unsqueeze(1)
+        return deviation * self.source, deviation * self.target
+
+
+def _vector(observation: Tensor | TensorDictBase) -> Tensor:
+    """The observation, or the robot's state beside images; an encoder's features begin with it."""
+    return observation[keys.STATE] if isinstance(observation, TensorDictBase) else observation
