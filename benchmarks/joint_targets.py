@@ -10,7 +10,6 @@ arm, and solves the task, is the demonstration. Policies see the arm's joints, t
 
 from __future__ import annotations
 
-import copy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,23 +36,13 @@ KP = 300
 
 def joint_env_args() -> dict[str, Any]:
     """Square, whose actions are seven joint positions in radians and the gripper."""
-    env_args = copy.deepcopy(task_env_args(SQUARE))
+    env_args = task_env_args(SQUARE)
     parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
     parts["right"] = {
         "type": "JOINT_POSITION",
         "input_type": "absolute",
-        "input_max": 1,
-        "input_min": -1,
-        "output_max": 0.05,
-        "output_min": -0.05,
         "kp": KP,
-        "damping_ratio": 1,
-        "impedance_mode": "fixed",
-        "kp_limits": [0, KP],
-        "damping_ratio_limits": [0, 10],
-        "qpos_limits": None,
         "interpolation": None,
-        "ramp_ratio": 0.2,
         "gripper": {"type": "GRIP"},
     }
     return env_args
@@ -107,9 +96,9 @@ def demonstrations(style: str, count: int) -> Path:
     path = source.with_name(f"{source.stem}_joint_targets.hdf5")
     if not path.exists():
         env = make_simulator(joint_env_args())
-        loop = StepLoop(env, [*OBSERVATION, f"{ARM}eef_pos", f"{ARM}eef_quat"])
         model = str(env.sim.model.get_xml())
-        write_robomimic(path, followed(source, loop), env_args=joint_env_args(), model_file=model)
+        episodes = followed(source, StepLoop(env, OBSERVATION))
+        write_robomimic(path, episodes, env_args=joint_env_args(), model_file=model)
         env.close()
     return path
 

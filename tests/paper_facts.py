@@ -1,4 +1,4 @@
-"""What the paper states, each with its place: transcribed from the paper, and never from the code.
+"""This table holds what the paper states, each with its place; it is never copied from the code.
 
 Whatever repeats a number of the paper is compared with this table (tests/benchmarks/test_paper_facts.py).
 """

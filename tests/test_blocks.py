@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 GIVEN = re.compile(r"# Given: ([\w, ]+); .*\.\n")
 TRAINED = "iterations=1_000"
-"""What only the long programs have, which tests/test_quickstart.py shortens."""
+"""Only the long programs have this; tests/test_quickstart.py shortens them."""
 
 
 def _blocks() -> list[tuple[str, str]]:

@@ -274,12 +274,12 @@ class Method:
 
     @property
     def is_flow(self) -> bool:
-        """Whether the field is trained at all times, so that it may be integrated in any number of steps."""
+        """It is a flow if the field is trained at all times: any number of steps then integrates it."""
         return not self.parts.played
 
     @property
     def is_regression(self) -> bool:
-        """Whether the field is trained at ``t = 0`` alone."""
+        """A regression is trained at ``t = 0`` alone."""
         return self.parts.prior is PointPrior
 
     @property
@@ -316,7 +316,7 @@ class Method:
         return None if name is None else Method(name, self.chunk_length)
 
     def nfes(self, asked: Sequence[int]) -> list[int]:
-        """How many network evaluations it is played with, the largest first; its own if no flow."""
+        """Return with how many network evaluations it is played, the largest first; its own if no flow."""
         return sorted(set(asked), reverse=True) if self.is_flow else [self.parts.played["nfe"]]
 
     def temperatures(self, asked: Sequence[float]) -> Sequence[float]:

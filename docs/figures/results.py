@@ -414,7 +414,7 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
 
 
 PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-"""Where a page has the table of a run's rows."""
+"""This matches the table of a run's rows in a page."""
 
 
 def main() -> None:

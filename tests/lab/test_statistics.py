@@ -69,7 +69,7 @@ def test_paired_probability_is_that_of_a_beta(wins, losses):
 
 
 def test_what_is_chosen_elsewhere_gains_nothing_by_chance():
-    """Of settings that are equally good, the best of all episodes looks better; the chosen one does not."""
+    """The best of equally good settings looks better on all episodes; the chosen one does not."""
     rng = np.random.default_rng(0)
     solved = (rng.random((2_000, 3, 50)) < 0.5).astype(int)
     chosen = np.array([chosen_elsewhere(each).mean() for each in solved])

@@ -209,7 +209,7 @@ def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
 
 
 def image_key(feature: str) -> str:
-    """What a camera's feature is called here: ``observation.images.front`` is ``front_image``."""
+    """Return the name of a camera's images here: ``observation.images.front`` is ``front_image``."""
     return f"{feature.rpartition('.')[2]}_image"
 
 
