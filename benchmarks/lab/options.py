@@ -233,7 +233,7 @@ def check_single(options: Options, *names: str) -> None:
 
 
 PRESETS: dict[str, Options] = {
-    # One seed, a small network and a short training: a first table within five minutes on two cores.
+    # One seed, a small network and half of the training that the tables have: a first table.
     "quick": Options(data=DataOptions(demonstrations=(100,)), training=TrainingConfig(iterations=5_000)),
     # Twice the training and the episodes, three seeds.
     "cpu": Options(data=DataOptions(demonstrations=(150, 300)), evaluation=Evaluation(seeds=3, episodes=50)),
