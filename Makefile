@@ -78,6 +78,7 @@ fuzz: install
 # The charts and the table of the results page, from docs/results; flowchart and timeline.
 results: install
 	PYTHONPATH=benchmarks $(BIN)/python docs/figures/results.py
+	PYTHONPATH=benchmarks $(BIN)/python docs/figures/leaderboard.py
 	$(BIN)/python docs/figures/diagrams.py
 
 docs: install

@@ -39,6 +39,8 @@ SOURCES = {  # what a chart calls them, in which colour and with which mark
     "history": ("history conditioning", "0.2", "P"),
     "a2a": ("learned, of the last actions", "0.2", "X"),
     "forecast": ("learned, of both", "0.2", "*"),
+    "regression": ("regression", "0.2", "p"),
+    "mip": ("MIP", "#a6761d", "s"),
 }
 OPERATORS = {"ph": "one operator", "mh": "six operators"}
 
@@ -48,6 +50,14 @@ def read(name: str) -> DataFrame:
     rows = read_csv(DATA / f"{name}.csv", comment="#")
     tasks = rows["cells"] if "cells" in rows else rows["task"].str.split().str.len()
     return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
+
+
+def read_played(name: str) -> DataFrame:
+    """The rows of a run, with their source, the factor of its noise, and the outcome of every episode."""
+    rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
+    options = rows["options"].where(rows["options"] == "", "," + rows["options"])
+    rows = rows.assign(source=rows["prior"] + options, noise=rows.get("temperature", Series(1.0, rows.index)))
+    return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
 
 
 def wilson(success: float, total: float) -> np.ndarray:
@@ -372,12 +382,7 @@ def played_table(name: str) -> str:
     A line per NFE and factor of the source's noise, and per NFE one in which every source has its own best
     factor, chosen on other episodes. Seeds are taken together.
     """
-    rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
-    rows["source"] = [
-        ",".join(filter(None, pair)) for pair in zip(rows["prior"], rows["options"], strict=True)
-    ]
-    rows["noise"] = rows.get("temperature", Series(1.0, rows.index))
-    rows["solved"] = [np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]]
+    rows = read_played(name)
     names = [source for source in SOURCES if source in set(rows["source"])]
     text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
     text.append("|---" * (2 + len(names)) + "|")
@@ -413,6 +418,8 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
     return f"| {nfe} | {noise} | " + " | ".join(cells) + " |"
 
 
+TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the table of a page that has one."""
 PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
 """This matches the table of a run's rows in a page."""
 
@@ -422,10 +429,9 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     for draw in one_step, steps, demonstrations, iterations, memory, noise, actions, human:
         draw()
-    marked = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
     pages = {PAGE: table(), DOCS / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
     for page, text in pages.items():
-        text = marked.sub(text, page.read_text())
+        text = TABLE.sub(text, page.read_text())
         page.write_text(PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", text))
 
 

@@ -1,0 +1,108 @@
+"""The leaderboard: which method solves most on human demonstrations, at how many network evaluations.
+
+PYTHONPATH=benchmarks python docs/figures/leaderboard.py    # or: make results; writes a picture and a table
+
+Intervals are of 95%, from a bootstrap over training seeds and episodes. A rank is that among all lines of the
+table, and its interval is of the same bootstrap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pandas import DataFrame, concat
+from results import DATA, DOCS, GAUSSIAN, OUT, SOURCES, TABLE, figure, finish, read, read_played, save
+from scipy.stats import rankdata
+
+from lab.statistics import resampled_means
+
+PAGE = DOCS / "leaderboard.md"
+FAMILIES = {  # human demonstrations and how many, and the rows of their runs
+    "door, 25": "door_20000",
+    "Push-T, 25": "pusht_25",
+    "Push-T, 50": "pusht_50",
+    "Push-T, 206": "pusht_206",
+}
+
+
+def _played() -> dict[str, DataFrame]:
+    """The rows of the runs of each family, with the source's own noise."""
+    found = {name: read_played(run) for name, run in FAMILIES.items() if (DATA / f"{run}.jsonl").exists()}
+    return {name: rows[rows["noise"] == 1].assign(family=name) for name, rows in found.items()}
+
+
+def pairs() -> DataFrame:
+    """Episodes won and lost of the Gaussian source's with the same NFE, over all families that have both."""
+    parts = [read("pusht").dropna(subset=["won"])]
+    for rows in _played().values():
+        both = rows.merge(rows[rows["source"] == GAUSSIAN], on=["seed", "nfe"], suffixes=("", "_base"))
+        for ahead, name in (1, "won"), (-1, "lost"):
+            differences = both["solved"] - both["solved_base"]
+            both[name] = [(ahead * difference > 0).sum() for difference in differences]
+        parts.append(both[both["source"] != GAUSSIAN])
+    return concat(parts).groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
+
+
+def trials() -> DataFrame:
+    """The episodes that each training solved with the source's own noise, a row per seed and NFE."""
+    pusht = read("pusht")
+    pusht = pusht.assign(
+        family="Push-T, " + pusht["demonstrations"].astype(str), rate=pusht["seed_success"].str.split()
+    ).explode("rate")
+    pusht["successes"] = (pusht["rate"].astype(float) * pusht["episodes"] / 100).round().astype(int)
+    return concat([pusht, *_played().values()])[["family", "source", "nfe", "successes", "episodes"]]
+
+
+def standings() -> DataFrame:
+    """Success per method and NFE in percent, by family and in the mean, with ranks and intervals."""
+    rng, lines, draws = np.random.default_rng(0), [], []
+    for (source, nfe), part in trials().groupby(["source", "nfe"]):
+        families = {name: group for name, group in part.groupby("family")}
+        if set(families) != set(FAMILIES):
+            continue
+        draws.append(
+            100 * resampled_means([(g["successes"], g["episodes"].iloc[0]) for g in families.values()], rng)
+        )
+        rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in families.items()}
+        lines.append({"source": source, "nfe": nfe, "mean": np.mean(list(rates.values())), **rates})
+    frame, draws = DataFrame(lines), np.stack(draws)
+    ends = {"mean": draws, "rank": rankdata(-draws, axis=0)}
+    frame["rank"] = rankdata(-frame["mean"], "min")
+    for name, values in ends.items():
+        frame[f"{name}_low"], frame[f"{name}_high"] = np.percentile(values, (2.5, 97.5), axis=1)
+    return frame.sort_values("mean", ascending=False, kind="stable")
+
+
+def draw() -> None:
+    """The mean over families against the number of network evaluations."""
+    frame = standings()
+    made, (axis,) = figure(8, 4.6, 1, "Human demonstrations: the mean of four sets")
+    for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
+        part = frame[frame["source"] == source].sort_values("nfe")
+        if len(part):
+            bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
+            places = part["nfe"] * (1 + 0.03 * (k - 1.5))
+            axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
+    finish(axis, "", xlabel="network evaluations per chunk (NFE)", ylabel="solved in percent, 95% interval")
+    axis.set(xscale="log", ylim=(0, None))
+    axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])
+    axis.minorticks_off()
+    save(made, "leaderboard", 3)
+
+
+def table() -> str:
+    """The standings, in Markdown."""
+    names, told = ("mean", *FAMILIES), pairs()
+    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost |", "|---" * (4 + len(names)) + "|"]
+    for _, row in standings().iterrows():
+        place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
+        pair = told.loc[row["source"], row["nfe"]] if (row["source"], row["nfe"]) in told.index else None
+        rates = [f"{row[name] + 1e-6:.0f}" for name in names]
+        cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
+        text.append(f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} |")
+    return "\n".join(text) + "\n"
+
+
+if __name__ == "__main__":
+    OUT.mkdir(parents=True, exist_ok=True)
+    draw()
+    PAGE.write_text(TABLE.sub(lambda _: table(), PAGE.read_text()))
