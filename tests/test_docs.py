@@ -155,9 +155,9 @@ def test_the_table_of_results_is_that_of_the_stored_numbers():
     results = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(results)
     assert results.table() in results.PAGE.read_text()
-    assert results.human_table() in (DOCS / "evidence.md").read_text()
+    assert results.human_table() in (DOCS / "notes" / "evidence.md").read_text()
     assert results.paper_table() in (DOCS / "paper.md").read_text()
-    notes = (DOCS / "evidence.md").read_text()
+    notes = (DOCS / "notes" / "evidence.md").read_text()
     shown = {name for name, _ in results.PLAYED.findall(notes)}
     assert shown == {path.stem for path in results.DATA.glob("*.jsonl")}
     for found in results.PLAYED.finditer(notes):

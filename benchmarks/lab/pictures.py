@@ -47,7 +47,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         task = played[0].task()
         if not options.run.films:
             continue
-        drawn = "robosuite" in (task.environment or {})  # by our renderer
+        drawn = task.environment is not None  # of robosuite or Gymnasium
         if drawn and rendering_backend() is None:
             print(
                 "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "

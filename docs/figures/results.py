@@ -429,7 +429,7 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     for draw in one_step, steps, demonstrations, iterations, memory, noise, actions, human:
         draw()
-    pages = {PAGE: table(), DOCS / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
+    pages = {PAGE: table(), DOCS / "notes" / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
     for page, text in pages.items():
         text = TABLE.sub(text, page.read_text())
         page.write_text(PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", text))

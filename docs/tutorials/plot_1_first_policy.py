@@ -236,4 +236,4 @@ print(loaded.prior)
 
 # %%
 # ``python benchmarks/navigation1d.py`` compares more sources on this task (:doc:`lab notes
-# </evidence>`). Next: :doc:`a prior of your own <plot_2_own_prior>`.
+# </notes/evidence>`). Next: :doc:`a prior of your own <plot_2_own_prior>`.

@@ -241,4 +241,4 @@ for iteration in (10, 800):
 # at the two sides of the obstacle.)
 #
 # Every benchmark writes these measures below its success rates. On robot tasks a leak once looked
-# like a gain of 40 points for a warm source at NFE 1 (:doc:`lab notes </evidence>`).
+# like a gain of 40 points for a warm source at NFE 1 (:doc:`lab notes </notes/evidence>`).

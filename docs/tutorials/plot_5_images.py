@@ -264,5 +264,5 @@ plt.show()
 # Lift from two cameras of 48 x 48 pixels, 100 scripted demonstrations, 3,000 iterations of batch
 # 64, one seed: policies from the Gaussian source, WP-Past and WP-Preview solve 25 of 25 episodes, at
 # NFE 3 and at NFE 1, and an untrained one solves none (15 minutes on two cores;
-# :doc:`lab notes </evidence>`). :doc:`/images` says how demonstrations get their images, and what
+# :doc:`lab notes </notes/evidence>`). :doc:`/images` says how demonstrations get their images, and what
 # larger encoders need.

@@ -301,7 +301,7 @@ folder.cleanup()
 # ----------
 # This was one seed of each. The benchmark has the same toy with larger networks, 12,000 control
 # steps and three seeds: ``benchmarks/prior_space_rl.py --preset unit --prior gaussian past --centre mean``.
-# :doc:`The lab notes </evidence>` have the results. With chunks of eight both agents
+# :doc:`The lab notes </notes/evidence>` have the results. With chunks of eight both agents
 # learn to solve every episode, in about the same number of steps. With chunks of four the Gaussian
 # policy meets the reward so rarely that its agent never learns where it is, and WP-Past's agent does as
 # before.

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from tests.envs.test_gymnasium import Dial
+from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import play_episode, record_filmstrip
 
 pytest.importorskip("robosuite")
 
 from warmprior.envs import RobosuiteEnv
-from warmprior.envs.description import environment_description, environment_of
+from warmprior.envs.description import environment_description, environment_of, registered_description
 from warmprior.envs.simulator import task_env_args
 
 
@@ -44,3 +48,35 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
         assert np.array_equal(states[2 if policy_seed == 0 else 5], env.base_env.loop.state())
     assert not np.array_equal(states[2], states[5])  # another policy seed, another noise
     assert actor.sampler.generator is None
+
+
+class DrawnDial(Dial):
+    """It draws pictures as bright as the steps that it took."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.full((8, 8, 3), self.turns, np.uint8)
+
+
+def test_a_policy_of_gymnasium_is_filmed_by_its_environment(tmp_path, monkeypatch):
+    gymnasium.register("DrawnDial-v0", DrawnDial, max_episode_steps=4)
+    monkeypatch.setitem(gymnasium.registry, "DrawnDial-v0", gymnasium.registry.pop("DrawnDial-v0"))
+    recorded = {"id": "DrawnDial-v0", "kwargs": {"render_mode": "human"}, "max_episode_steps": 4}
+    described = registered_description({**recorded, "success": "solved", "observation_keys": []}, 1)
+    network = VelocityMLP(1, 2, 2, observation_steps=1, hidden_dim=16)
+    actor = WarmPriorActor(network, GaussianPrior(2), clip=1.0, environment=described)
+    film = tmp_path / "film.mp4"
+    strip = record_filmstrip(actor, seed=0, frames=9, size=16, video=film, terminate_on_success=False)
+    assert [int(frame[0, 0, 0]) for frame in strip.frames] == strip.steps == [0, 1, 2, 3, 4]
+    av = pytest.importorskip("av")
+    with av.open(str(film)) as container:
+        stream = container.streams.video[0]
+        assert (stream.average_rate, stream.frames) == (5, 5)
+    bare = environment_of(actor)
+    with pytest.raises(ValueError, match="render_mode"):
+        record_filmstrip(actor, seed=0, frames=2, env=bare)

@@ -91,7 +91,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Ca
     """
     description: Any = actor.environment
     adapters: dict[str, Transform] = {}
-    if _is_registered(description):
+    if is_registered(description):
         make_env: Callable[..., EnvBase] = partial(registered_env, description["gymnasium"])
     elif _is_complete(description):
         make_env, adapters = robosuite_parts(description)
@@ -139,7 +139,7 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
 def environment_name(actor: WarmPriorActor) -> str | None:
     """What robosuite or Gymnasium calls the environment that a policy was made for, if it is known."""
     description: Any = actor.environment
-    if _is_registered(description):
+    if is_registered(description):
         return str(description["gymnasium"]["id"])
     try:
         return str(description["robosuite"]["env_args"]["env_name"])
@@ -158,7 +158,7 @@ def registered_description(environment: Mapping[str, Any], observation_steps: in
     }
 
 
-def _is_registered(description: Any) -> bool:
+def is_registered(description: Any) -> bool:
     """Whether it is what :func:`registered_description` gives."""
     try:
         known = description.keys() == {"gymnasium", "observation_steps"}

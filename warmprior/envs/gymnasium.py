@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -13,6 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import CatTensors, Compose, DoubleToFloat, GymWrapper, RenameTransform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
 
@@ -110,6 +112,7 @@ def registered_env(
     *,
     terminate_on_success: bool = True,
     horizon: int | None = None,
+    render_mode: str | None = None,
 ) -> TransformedEnv:
     """An environment of Gymnasium's registry, as data or a policy describe it.
 
@@ -121,6 +124,7 @@ def registered_env(
             ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is said under ``"success"``.
         terminate_on_success: see :func:`gym_env`.
         horizon: steps per episode, in place of ``"max_episode_steps"``.
+        render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
 
     Raises:
         ImportError: if no environment of this name is registered.
@@ -146,10 +150,13 @@ def registered_env(
         raise ValueError(
             f"{name} was recorded with the wrappers {wrappers}: build it yourself, with make_env"
         )
+    if render_mode is not None and (backend := rendering_backend()) is not None:
+        os.environ["MUJOCO_GL"] = backend  # environments of MuJoCo would first try to open a window
+    kwargs = {key: value for key, value in description.get("kwargs", {}).items() if key != "render_mode"}
     env = gymnasium.make(
         name,
         max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
-        **description.get("kwargs", {}),
+        **kwargs | ({} if render_mode is None else {"render_mode": render_mode}),
     )
     success = description.get("success")
     made = gym_env(

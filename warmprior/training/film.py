@@ -57,7 +57,8 @@ def _resized(image: np.ndarray, size: int) -> np.ndarray:
 
 def _picture(env: Any) -> np.ndarray:
     try:
-        picture = env.render()
+        # Gymnasium's environments of MuJoCo fail in their own way where they were made without a mode.
+        picture = env.render() if getattr(env, "render_mode", "rgb_array") is not None else None
     except NotImplementedError:
         picture = None
     if picture is None:
@@ -117,8 +118,8 @@ def record_filmstrip(
         video: where to write an MP4 of the same episode as well; needs PyAV.
         env: another environment than the one that the policy describes, with the policy's transforms; its
             base has a method ``render`` that gives a picture, uint8 ``[h, w, 3]``. It is closed at the end.
-        rate: control steps per second of a video; that of robosuite's environment by default.
-        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`; and ``success``, see
+        rate: control steps per second of a video; that of the policy's environment by default.
+        options: further ones of :func:`~warmprior.envs.environment_of`; and ``success``, see
             :func:`play_episode`.
 
     Raises:
@@ -139,11 +140,16 @@ def record_filmstrip(
     if video is not None and (size < 2 or size % 2):  # the encoder takes pixels two by two
         raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
     success = options.pop("success", SUCCESS)
+    if env is None:
+        from warmprior.envs.description import environment_of, is_registered
+
+        if is_registered(actor.environment):
+            env = environment_of(actor, render_mode="rgb_array", **options)
+            rate = rate or env.base_env.metadata.get("render_fps")
     frame: Callable[[Any, int], np.ndarray]
     quick: Callable[[Any, int], np.ndarray]
     frame = quick = _resized
     if env is None:
-        from warmprior.envs.description import environment_of
         from warmprior.envs.rendering import EnvRenderers, require_rendering
 
         require_rendering()

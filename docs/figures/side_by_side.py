@@ -1,0 +1,55 @@
+"""One GIF from several films of the same episode, each under its name.
+
+python docs/figures/side_by_side.py docs/_static/door.gif "Gaussian source=gaussian.mp4" "WP-Past=past.mp4"
+
+It plays at a third of the speed. A film that ends before the others stays at its last picture.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
+
+from warmprior.io.extras import require
+
+RATE = 12  # pictures per second
+SLOWER = 3
+BAR = 30  # height of the names, in pixels
+
+
+def pictures(path: Path) -> list[Image.Image]:
+    """The film, slowed down, at :data:`RATE` pictures per second."""
+    av = require("av", "lerobot")
+    with av.open(str(path)) as film:
+        rate = float(film.streams.video[0].average_rate)
+        frames = [frame.to_image() for frame in film.decode(video=0)]
+    step = rate / SLOWER / RATE  # frames of the film per picture
+    return [frames[min(round(k * step), len(frames) - 1)] for k in range(int(len(frames) / step) + 1)]
+
+
+def main(out: str, *films: str) -> None:
+    """Write the GIF."""
+    names = [film.split("=")[0] for film in films]
+    columns = [pictures(Path(film.split("=", 1)[1])) for film in films]
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 15)
+    side, length = columns[0][0].width, max(map(len, columns))
+    joined = []
+    for k in range(length):
+        page = Image.new("RGB", (side * len(films), side + BAR), "white")
+        draw = ImageDraw.Draw(page)
+        for column, (name, frames) in enumerate(zip(names, columns, strict=True)):
+            page.paste(frames[min(k, len(frames) - 1)], (column * side, BAR))
+            draw.text((column * side + 8, 6), name, fill="black", font=font)
+        joined.append(page)
+    palette = joined[length // 2].quantize(128, Image.Quantize.MEDIANCUT)
+    reduced = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in joined]
+    durations = [1000 // RATE] * (length - 1) + [1500]
+    reduced[0].save(out, save_all=True, append_images=reduced[1:], duration=durations, loop=0, optimize=True)
+    print(f"{out}: {Path(out).stat().st_size:,} bytes, {length} pictures")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
