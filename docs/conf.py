@@ -85,6 +85,15 @@ def _one_download(app, docname, source):
         source[0] = re.sub(f"{above}|{below}", "", source[0], flags=re.M | re.S)
 
 
+def _link_as_repository(app, docname, source):
+    """Turn links of Markdown pages to tutorial scripts into links to built tutorials; give the index its tree."""
+    if app.env.doc2path(docname).suffix == ".md":
+        built = re.sub(r"\]\(tutorials\)", "](auto_tutorials/index.rst)", source[0])
+        source[0] = re.sub(r"\]\(tutorials/(\w+)\.py\)", r"](auto_tutorials/\1.rst)", built)
+    if docname == "index":
+        source[0] += (_Path(__file__).parent / "_templates" / "contents.md").read_text()
+
+
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
     """Show what a class takes, with types, where a base class or metaclass hides it behind ``*args``."""
     if what == "class" and (signature or "").startswith("(*args"):
@@ -165,6 +174,7 @@ def _keep_what_formulas_need(app, error):
 def setup(app):
     """Connect the handlers above."""
     app.connect("source-read", _one_download)
+    app.connect("source-read", _link_as_repository)
     app.connect("source-read", _link_names)
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)

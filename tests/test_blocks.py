@@ -15,7 +15,11 @@ from tests.data.synthetic import write_robomimic_file
 from warmprior import Prior
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "notes").iterdir()),
+]
 GIVEN = re.compile(r"# Given: ([\w, ]+); .*\.\n")
 TRAINED = "iterations=1_000"
 """Only the long programs have this; tests/test_quickstart.py shortens them."""

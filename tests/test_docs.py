@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import doctest
 import importlib
-import importlib.util
 import inspect
 import pkgutil
 import re
@@ -150,20 +149,17 @@ def test_the_prior_of_your_own_runs():
     assert (loc[1] == history["actions"][1, -1]).all()
 
 
-def test_the_table_of_results_is_that_of_the_stored_numbers():
-    spec = importlib.util.spec_from_file_location("results", DOCS / "figures" / "results.py")
-    results = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(results)
-    assert results.table() in results.PAGE.read_text()
-    assert results.human_table() in (DOCS / "notes" / "evidence.md").read_text()
-    assert results.paper_table() in (DOCS / "paper.md").read_text()
-    notes = (DOCS / "notes" / "evidence.md").read_text()
-    shown = {name for name, _ in results.PLAYED.findall(notes)}
-    assert shown == {path.stem for path in results.DATA.glob("*.jsonl")}
-    for found in results.PLAYED.finditer(notes):
-        assert found[0] == f"{found[1]}{found[2]}{results.played_table(found[1])}"
-    shown = set(re.findall(r"\(_static/results/(\w+)\.png\)", results.PAGE.read_text()))
-    assert shown == {path.stem for path in results.OUT.glob("*.png")}
+def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "figures")
+    results, leaderboard = importlib.import_module("results"), importlib.import_module("leaderboard")
+    texts = {page: page.read_text() for page in (*results.tables(), *leaderboard.tables())}
+    for page, table in (results.tables() | leaderboard.tables()).items():
+        assert results.with_tables(texts[page], table) == texts[page]
+    text = "".join(texts.values())
+    played = {name for name, _ in results.PLAYED.findall(text)}
+    assert played == {path.stem for path in results.DATA.glob("*.jsonl")}
+    shown = set(re.findall(r"_static/results/(\w+)\.svg\)", text))
+    assert shown == {path.stem for path in results.OUT.iterdir()}
     for file in results.DATA.glob("*.csv"):
         rows = results.read(file.stem)
         assert rows["success"].between(0, 100).all() and rows["command"].notna().all()

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 OUT = Path(__file__).parents[1] / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
+SVG = {"metadata": {"Date": None}}  # the same file every time
+matplotlib.rcParams["svg.hashsalt"] = "warmprior"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=1", BLUE),
-    ("Are actions absolute poses\nor joint targets?", "GaussianPrior(8), nfe=1", GREY),
+    ("Are actions absolute poses\nor joint targets?", "GaussianPrior(8), nfe=3", GREY),
     ("At most 25 demonstrations\nby a script or an expert?", "PastPrior(8), nfe=1", BLUE),
     ("More than 100 by people, and time\nfor nine evaluations per chunk?", "GaussianPrior(8), nfe=9", GREY),
 )
@@ -41,8 +44,8 @@ def box(
 
 def flowchart() -> None:
     """Chart H: which source to take."""
-    made, axis = canvas(6.4, 5.2)
-    left, right, step, top = 17.0, 51.0, 10.2, 46.0
+    made, axis = canvas(6.4, 4.6)
+    left, right, step, top = 17.0, 51.0, 9.2, 41.4
     for k, (question, answer, color) in enumerate(QUESTIONS):
         y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
@@ -61,7 +64,7 @@ def flowchart() -> None:
         ec=BLUE,
         color="white",
     )
-    made.savefig(OUT / "which_source.png", dpi=110)
+    made.savefig(OUT / "which_source.svg", **SVG)
 
 
 def timeline() -> None:
@@ -90,7 +93,7 @@ def timeline() -> None:
     bar(7, 0, 8, "forecast\nwith A", fc=LIGHT)
     bar(7, 8, 16, "mean: forecast,\nwidth 1", fc=ORANGE, ec=ORANGE, color="white")
     bar(7, 16, 24, "cold: mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
-    made.savefig(OUT / "timeline.png", dpi=110)
+    made.savefig(OUT / "timeline.svg", **SVG)
 
 
 if __name__ == "__main__":

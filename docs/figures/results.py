@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,6 +22,7 @@ from pandas import DataFrame, Series, concat, read_csv, read_json
 from lab.paper import PAPER_DEFAULT_SIGMA, PAPER_SUCCESS, STATE
 from lab.statistics import chosen_elsewhere
 
+matplotlib.rcParams["svg.hashsalt"] = "warmprior"  # the same file every time
 DOCS = Path(__file__).parents[1]
 DATA, OUT, PAGE = DOCS / "results", DOCS / "_static" / "results", DOCS / "results.md"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
@@ -42,13 +44,14 @@ SOURCES = {  # what a chart calls them, in which colour and with which mark
     "regression": ("regression", "0.2", "p"),
     "mip": ("MIP", "#a6761d", "s"),
 }
+WIDTH = 5.6  # of a picture, in inches: readable on a screen of 400 pixels
 OPERATORS = {"ph": "one operator", "mh": "six operators"}
 
 
 def read(name: str) -> DataFrame:
     """The rows of one file, with the number of episodes that each stands for."""
     rows = read_csv(DATA / f"{name}.csv", comment="#")
-    tasks = rows["cells"] if "cells" in rows else rows["task"].str.split().str.len()
+    tasks = rows["settings"] if "settings" in rows else rows["task"].str.split().str.len()
     return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
 
 
@@ -75,13 +78,17 @@ def gain(row: Series, base: Series) -> tuple[float, float, float]:
 
 
 def gains() -> DataFrame:
-    """Success minus the Gaussian source's at one step: cells, and means of cells."""
-    cells, means = read("one_step"), read("means")
+    """Success minus the Gaussian source's at one step: settings, and means of settings."""
+    settings, means = read("one_step"), read("means")
     names = (
-        cells["task"] + ", " + cells["demonstrations"].astype(str) + " of " + cells["style"].map(OPERATORS)
+        settings["task"]
+        + ", "
+        + settings["demonstrations"].astype(str)
+        + " of "
+        + settings["style"].map(OPERATORS)
     )
     found = []
-    for rows, name in (cells, names), (means, "mean of " + means["setting"]):
+    for rows, name in (settings, names), (means, "mean of " + means["setting"]):
         for setting, group in rows.groupby(name, sort=False):
             base = group[group["source"] == GAUSSIAN].iloc[0]
             for _, row in group[group["source"] != GAUSSIAN].iterrows():
@@ -92,11 +99,11 @@ def gains() -> DataFrame:
 def figure(width: float, height: float, columns: int, title: str, rows: int = 1) -> tuple[Figure, list[Axes]]:
     """A picture with a title that says what it shows, and its axes."""
     made = Figure(figsize=(width, height), layout="constrained")
-    made.suptitle(title, fontsize=13, fontweight="bold")
+    made.suptitle(title, fontsize=11.5, fontweight="bold")
     return made, list(made.subplots(rows, columns, squeeze=False).flat)
 
 
-def save(made: Figure, name: str, columns: int = 5) -> None:
+def save(made: Figure, name: str, columns: int = 2) -> None:
     """Write the picture, with one legend below."""
     shown = [pair for axis in made.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in reversed(shown)}
@@ -104,7 +111,7 @@ def save(made: Figure, name: str, columns: int = 5) -> None:
     made.legend(
         [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, frameon=False
     )
-    made.savefig(OUT / f"{name}.png", dpi=110)
+    made.savefig(OUT / f"{name}.svg", metadata={"Date": None})
 
 
 def finish(axis: Axes, title: str, **settings: object) -> None:
@@ -133,10 +140,7 @@ def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool 
 def one_step() -> None:
     """Chart A: gains at one step."""
     frame = gains()
-    made, (axis,) = figure(
-        11.6, 11.5, 1, "One step: correlated noise is nowhere clearly behind the Gaussian source,\n"
-        "plain warm sources gain with few demonstrations, and lose on square and transport of six operators",
-    )  # fmt: skip
+    made, (axis,) = figure(WIDTH, 10.5, 1, "Success at one step, minus that of the Gaussian source")
     names, order = list(dict.fromkeys(frame["setting"])), []
     for keys in (", 150", ", 300", "of 150"), (", 25", "of 25"), (", 10 ", "of 10"), ("of all",):
         order += [name for key in keys for name in names if key in name]
@@ -152,9 +156,7 @@ def one_step() -> None:
     axis.axvline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
     axis.set_yticks(range(len(order)), order)
     axis.set_ylim(len(order) - 0.5, -0.5)
-    axis.set_xlabel(
-        "success minus the Gaussian source's, in points, with a 95% interval over seeds x episodes"
-    )
+    axis.set_xlabel("difference in points, with its 95% interval")
     axis.grid(axis="x", color="0.9")
     save(made, "one_step")
 
@@ -164,27 +166,23 @@ def steps() -> None:
     rows = read("steps")
     many, two = rows["demonstrations"] >= 150, rows["task"] == "transport"
     parts = {
-        "150 or 300 demonstrations, one arm:\nmean of six cells": rows[many & ~two],
-        "150 or 300, two arms:\nmean of two cells": rows[two],
+        "150 or 300 demonstrations, one arm:\nmean of six settings": rows[many & ~two],
+        "150 or 300, two arms:\nmean of two settings": rows[two],
         "25 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 25],
         "10 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 10],
     }
-    title = "With few demonstrations warm sources are ahead at one step, and more steps take the lead away"
-    made, axes = figure(11.6, 4.8, 4, title)
+    made, axes = figure(WIDTH, 6.6, 2, "Success against the number of integration steps", rows=2)
     for axis, (name, part) in zip(axes, parts.items(), strict=True):
         lines(axis, part, "nfe", [1, 3, 9])
         finish(axis, name, xlabel="integration steps (NFE)")
-    axes[0].set_ylabel("success in percent, 95% interval")
+    made.supylabel("success in percent, 95% interval", fontsize=10)
     save(made, "steps")
 
 
 def demonstrations() -> None:
     """Chart C: success against demonstrations, with a dot per seed."""
     rows = read("one_step")
-    title = (
-        "WP-Past and WP-Preview gain on square and can while demonstrations are few (one step; dots: seeds)"
-    )
-    made, axes = figure(11.6, 4.8, 3, title)
+    made, axes = figure(WIDTH, 8, 1, "Success at one step against demonstrations (dots: seeds)", rows=3)
     for axis, task in zip(axes, ("square", "can", "stack"), strict=True):
         part = rows[(rows["task"] == task) & (rows["style"] == "ph")]
         lines(axis, part, "demonstrations", [10, 25, 150], interval=False)
@@ -193,7 +191,7 @@ def demonstrations() -> None:
             place = row["demonstrations"] * (1 + 0.07 * (list(SOURCES).index(row["source"]) - 1))
             axis.plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
         finish(axis, task, xlabel="demonstrations of one operator")
-    axes[0].set_ylabel("success in percent")
+    made.supylabel("success in percent", fontsize=10)
     save(made, "demonstrations")
 
 
@@ -206,12 +204,11 @@ def iterations() -> None:
         "square, six operators (three seeds)": rows[six & (rows["task"] == "square")],
         "square, one operator, the paper's loss\n(one seed, two at 20,000)": rows[~six],
     }
-    title = "WP-Past and WP-Preview need longer training, and correlated noise does not"
-    made, axes = figure(11.6, 4.8, 3, title)
+    made, axes = figure(WIDTH, 8.4, 1, "Success at one step against the length of the training", rows=3)
     for axis, (name, part) in zip(axes, parts.items(), strict=True):
         lines(axis, part, "iterations", [2_500, 5_000, 10_000, 20_000])
         finish(axis, name, xlabel="training iterations of batch 128", xlim=(2_100, 24_000))
-    axes[0].set_ylabel("success at one step in percent, 95% interval")
+    made.supylabel("success in percent, 95% interval", fontsize=10)
     save(made, "iterations")
 
 
@@ -220,14 +217,14 @@ def memory() -> None:
     rows = read("memory")
     each = rows["memory_gain"].astype(str).str.split()
     rows = rows.assign(gain=each.map(lambda values: np.mean([float(n) for n in values])))
-    made, axes = figure(11.6, 5.4, 2, "With six operators, policies that follow much of the past fail")
+    made, axes = figure(WIDTH, 7.6, 1, "Success against how much of the past the actions follow", rows=2)
     for axis, task in zip(axes, ("square", "transport"), strict=True):
         for _, row in rows[rows["task"] == task].iterrows():
             label, color, mark = SOURCES[row["source"]]
             axis.plot(row["gain"], row["success"], mark, ms=8, alpha=0.85, color=color, label=label)
         what = "memory gain: the part of a shift of the past that reappears in the actions"
         finish(axis, f"{task}, 300 demonstrations of six operators", xlabel=what, ylim=(-4, 100))
-    axes[0].set_ylabel("success at one step in percent")
+    made.supylabel("success in percent", fontsize=10)
     save(made, "memory")
 
 
@@ -242,8 +239,7 @@ def noise() -> None:
         "WP-Past, four settings (two or three seeds)": rows[few],
         "WP-Preview, square (one seed)": rows[~few],
     }
-    title = "More noise, white or correlated, takes losses away, and gains as well"
-    made, axes = figure(11.6, 5.6, 3, title)
+    made, axes = figure(WIDTH, 11, 1, "Success against the noise around the mean, at one step", rows=3)
     for axis, (name, part), warm in zip(axes, parts.items(), (PAST, PAST, PREVIEW), strict=True):
         keys = ["task", "demonstrations", "style", "actions"]
         for k, (setting, group) in enumerate(part.groupby(keys, sort=False)):
@@ -260,51 +256,26 @@ def noise() -> None:
         axis.plot([], [], "s", ms=8, mfc="none", mew=2, color="0.3", label="correlated noise")
         axis.axhline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
         finish(axis, name, xlabel="noise that averaging over a chunk leaves", xlim=(0, None))
-        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
-    axes[0].set_ylabel("success minus the Gaussian source's, in points")
-    made.savefig(OUT / "noise.png", dpi=110)
+        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
+    made.supylabel("success minus the Gaussian source's, in points", fontsize=10)
+    made.savefig(OUT / "noise.svg", metadata={"Date": None})
 
 
 def actions() -> None:
     """Chart G: deltas and poses."""
     rows = read("actions")
-    title = (
-        "From absolute poses most warm sources lose, and the Gaussian source does not (one step, one seed)"
-    )
-    made, axes = figure(11.6, 4.8, 4, title)
+    made, axes = figure(WIDTH, 6.6, 2, "Deltas and absolute poses, at one step (one seed)", rows=2)
     for axis, (setting, part) in zip(axes, rows.groupby(["task", "style"], sort=False), strict=True):
         for source, group in part.groupby("source", sort=False):
             label, color, mark = SOURCES[source]
             axis.plot(group["actions"], group["success"], mark + "-", color=color, label=label)
         finish(axis, f"{setting[0]}, {OPERATORS[setting[1]]}", ylim=(-3, 103), xlim=(-0.3, 1.3))
-    axes[0].set_ylabel("success in percent of 50 episodes")
+    made.supylabel("success in percent of 50 episodes", fontsize=10)
     save(made, "actions")
 
 
-def human() -> None:
-    """Human demonstrations: score and success against the number of integration steps."""
-    rows = read("pusht")
-    counts = rows["demonstrations"].unique()
-    title = "Human Push-T: with few demonstrations WP-Past leads, with all the Gaussian source at nine steps"
-    made, axes = figure(11.6, 7.4, len(counts), title, rows=2)
-    pairs = zip(axes[: len(counts)], axes[len(counts) :], strict=True)
-    for (count, part), pair in zip(rows.groupby("demonstrations", sort=False), pairs, strict=True):
-        scores = part.assign(success=part["score"])
-        lines(pair[0], scores, "nfe", [1, 3, 9], interval=False)
-        for _, row in scores.iterrows():
-            each = [float(n) for n in row["seed_score"].split()]
-            place = row["nfe"] * (1 + 0.025 * (list(SOURCES).index(row["source"]) - 2))
-            pair[0].plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
-        lines(pair[1], part, "nfe", [1, 3, 9])
-        finish(pair[0], f"{count} demonstrations", ylim=(25, 100))
-        finish(pair[1], "", xlabel="integration steps (NFE)", ylim=(0, 52))
-    axes[0].set_ylabel("score in percent (dots: seeds)")
-    axes[len(counts)].set_ylabel("solved in percent (95% interval)")
-    save(made, "human")
-
-
 def human_table() -> str:
-    """The numbers of :func:`human`, in Markdown."""
+    """Score and success on human demonstrations of Push-T, in Markdown."""
     rows = read("pusht")
     names = [source for source in SOURCES if source in set(rows["source"])]
     text = ["| demonstrations | steps | " + " | ".join(SOURCES[name][0] for name in names) + " |"]
@@ -424,16 +395,25 @@ PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
 """This matches the table of a run's rows in a page."""
 
 
-def main() -> None:
-    """Draw the charts, and write the tables into the pages."""
-    OUT.mkdir(parents=True, exist_ok=True)
-    for draw in one_step, steps, demonstrations, iterations, memory, noise, actions, human:
-        draw()
-    pages = {PAGE: table(), DOCS / "notes" / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
+def tables() -> dict[Path, str]:
+    """The table that each page marks."""
+    return {PAGE: table(), DOCS / "notes" / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
+
+
+def with_tables(page: str, text: str) -> str:
+    """A page with its table, and those of the runs whose rows it names."""
+    page = TABLE.sub(lambda _: text, page)
+    return PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", page)
+
+
+def write(pages: Mapping[Path, str]) -> None:
+    """Write the tables into their pages."""
     for page, text in pages.items():
-        text = TABLE.sub(text, page.read_text())
-        page.write_text(PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", text))
+        page.write_text(with_tables(page.read_text(), text))
 
 
 if __name__ == "__main__":
-    main()
+    OUT.mkdir(parents=True, exist_ok=True)
+    for draw in one_step, steps, demonstrations, iterations, memory, noise, actions:
+        draw()
+    write(tables())
