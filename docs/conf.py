@@ -86,7 +86,7 @@ def _one_download(app, docname, source):
 
 
 def _link_as_repository(app, docname, source):
-    """Turn links of Markdown pages to tutorial scripts into links to built tutorials; give the index its tree."""
+    """Link to built tutorials where Markdown links to their scripts, and give the index its tree."""
     if app.env.doc2path(docname).suffix == ".md":
         built = re.sub(r"\]\(tutorials\)", "](auto_tutorials/index.rst)", source[0])
         source[0] = re.sub(r"\]\(tutorials/(\w+)\.py\)", r"](auto_tutorials/\1.rst)", built)
