@@ -47,7 +47,12 @@ FAMILIES = {  # human demonstrations and how many, and the rows of their runs
 def _played() -> dict[str, DataFrame]:
     """The rows of the runs of each family, with the source's own noise."""
     found = {name: read_played(run) for name, run in FAMILIES.items() if (DATA / f"{run}.jsonl").exists()}
-    return {name: rows[rows["noise"] == 1].assign(family=name) for name, rows in found.items()}
+    # MIP's only noise is none; of the others this is the source as it was trained.
+    own = {
+        name: rows["noise"] == rows.groupby("source")["noise"].transform("max")
+        for name, rows in found.items()
+    }
+    return {name: rows[own[name]].assign(family=name) for name, rows in found.items()}
 
 
 def pairs() -> DataFrame:
