@@ -26,6 +26,13 @@ hypothesis.settings.register_profile("shared-machine", deadline=None)
 hypothesis.settings.load_profile("shared-machine")
 
 
+def pytest_collection_modifyitems(items):
+    """Without a GPU the tests that need one are skipped, each by its name."""
+    for item in items:
+        if item.get_closest_marker("cuda") and not torch.cuda.is_available():
+            item.add_marker(pytest.mark.skip(reason="needs a GPU"))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forks_copy_little():
     """Let the garbage collectors of forks leave alone what was there: to look at it copies it."""
