@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import socket
+import statistics
 import tempfile
 import time
 from collections.abc import Callable
@@ -44,6 +45,7 @@ from warmprior.data import LeRobotDemonstrations
 from warmprior.envs import RobosuiteEnv
 from warmprior.io.distributed import joined, rank
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
+from warmprior.training.options import PAPER
 
 BATCH = 256
 
@@ -62,26 +64,30 @@ def small_network() -> VelocityMLP:
     return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
 
 
-def cloning(network: nn.Module, folder: str | Path, device: str = "cpu") -> BehaviourCloning:
-    """A training of the network, ready to step; on a GPU as CUDA graphs."""
-    actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=BATCH)
-    options: dict[str, Any] = {"observation_steps": TO, "compile": device == "cuda"}
+def cloning(
+    network: nn.Module, folder: str | Path, device: str = "cpu", *, graphs: bool = False, batch: int = BATCH
+) -> BehaviourCloning:
+    """A training of the network, ready to step; if asked for as CUDA graphs."""
+    actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=batch)
+    options: dict[str, Any] = {"observation_steps": TO, "compile": graphs}
     training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, **options)
     actor.train()
     return training
 
 
-def step_of(network: nn.Module, device: str = "cpu") -> Callable[[], None]:
-    """A training step of a network alone, on random numbers; on a GPU as CUDA graphs."""
+def step_of(
+    network: nn.Module, device: str = "cpu", *, graphs: bool = False, batch: int = BATCH
+) -> Callable[[], None]:
+    """A training step of a network alone, on random numbers; if asked for as CUDA graphs."""
     network.to(device)
-    if device == "cuda":
+    if graphs:
         network.compile(mode="reduce-overhead")
     optimizer = torch.optim.AdamW(network.parameters(), fused=True)
-    shapes = (BATCH,), (BATCH, H, D_A), (BATCH, TO, D_O)
+    shapes = (batch,), (batch, H, D_A), (batch, TO, D_O)
     t, a, o = (torch.rand(shape, device=device) for shape in shapes)
 
     def step() -> None:
-        if device == "cuda":
+        if graphs:
             torch.compiler.cudagraph_mark_step_begin()
         loss = network(t, a, o).square().mean()
         optimizer.zero_grad()
@@ -162,13 +168,43 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
 # Training
 
 
+def lacks(device: str) -> bool:
+    """Say that a figure is left out, where it needs a GPU and there is none."""
+    if device == "cpu" or torch.cuda.is_available():
+        return False
+    tqdm.write("skipped, needs a GPU")
+    return True
+
+
 def train_step_over_network(clock: Clock, device: str = "cpu", calls: int = 1) -> float | None:
-    if device == "cuda" and not torch.cuda.is_available():
-        tqdm.write("cuda_train_step_over_network: skipped, needs a GPU")
+    if lacks(device):
+        return None
+    graphs = device != "cpu"
+    with tempfile.TemporaryDirectory() as folder:
+        ours = cloning(paper_network(), folder, device, graphs=graphs).step
+        return clock.ratio(ours, step_of(paper_network(), device, graphs=graphs), calls=calls)
+
+
+def steps_per_second(
+    clock: Clock,
+    device: str = "cpu",
+    network: Callable[[], nn.Module] = paper_network,
+    batch: int = PAPER.batch_size,
+    calls: int = 20,
+) -> dict[str, float] | None:
+    """Training steps of the library and of bare torch, as they are and on a GPU also as CUDA graphs."""
+    if lacks(device):
         return None
     with tempfile.TemporaryDirectory() as folder:
-        ours = cloning(paper_network(), folder, device).step
-        return clock.ratio(ours, step_of(paper_network(), device), calls=calls)
+        ways: dict[str, Callable[[], object]] = {}
+        for graphs in (False, True) if device != "cpu" else (False,):
+            name, options = " as graphs" if graphs else "", {"graphs": graphs, "batch": batch}
+            ways[f"warmprior{name}"] = cloning(network(), f"{folder}/{graphs}", device, **options).step
+            ways[f"torch{name}"] = step_of(network(), device, **options)
+        # Several steps are waited for together: a step that waits for nothing gains from it.
+        times = clock.times(*(partial(_round, step, calls) for step in ways.values()))
+    found = zip(ways, times, strict=True)
+    return {name: calls / statistics.median(seconds) for name, seconds in found}
 
 
 def preconditioning_over_network(clock: Clock) -> float:
@@ -339,6 +375,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
     "cuda_train_step_over_network": (partial(train_step_over_network, device="cuda", calls=20), "<= 1.05"),
+    "cuda_steps_per_second": (partial(steps_per_second, device="cuda"), ""),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "ddp_efficiency": (ddp_efficiency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),

@@ -51,7 +51,7 @@ def throughputs(folder, *argv):
 def test_throughput_writes_every_key(tmp_path):
     results = throughputs(tmp_path, "--only", "windows_over_torch", "preconditioning_over_network")
     found = {key for key, value in results.items() if value is not None}
-    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 11
+    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 12
     assert min(results["windows_over_torch"].values()) > 0 and results["preconditioning_over_network"] > 0
 
 
@@ -67,10 +67,22 @@ def test_rounds_are_interleaved_and_the_first_is_dropped():
     assert ratio == pytest.approx(3, rel=0.4)
 
 
+def test_steps_per_second_are_those_of_a_round():
+    class Fixed:
+        def times(self, *things):
+            for thing in things:
+                thing()
+            return [[2.0, 9.0, 1.0], [0.5, 0.1, 4.0]]
+
+    taken = throughput.steps_per_second(Fixed(), network=throughput.small_network, batch=4, calls=3)
+    assert taken == {"warmprior": 1.5, "torch": 6.0}
+
+
 @pytest.mark.slow
 def test_every_throughput_can_be_measured(tmp_path):
     script, out = throughput.__file__, ["--repeats", "1", "--out", str(tmp_path)]
     subprocess.run([sys.executable, script, *out], check=True)  # it renders, which no fork survives
     results = json.loads((tmp_path / "throughput.json").read_text())
     missing = {name for name, value in results.items() if value is None}
-    assert missing <= {"lerobot_windows_over_getitem", "cuda_train_step_over_network"}
+    on_gpus = {"cuda_train_step_over_network", "cuda_steps_per_second"}
+    assert missing <= {"lerobot_windows_over_getitem", *on_gpus}
