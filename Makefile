@@ -12,7 +12,7 @@ GROOT_NEEDS := tests/lerobot/groot_n15.txt
 CHECK_PYTHON := $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
 	{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
 
-.PHONY: install benchmark throughput test test-slow test-groot-n15 latest lint fuzz results docs clean
+.PHONY: install benchmark throughput gpu test test-slow test-groot-n15 latest lint fuzz results docs clean
 
 install: .venv/installed
 
@@ -36,6 +36,10 @@ benchmark: $(if $(wildcard .venv/installed),install,.venv/simulator)
 
 throughput: install
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
+
+# What needs a GPU, in parts that resume: make gpu PART=2, or all.
+gpu: install
+	$(BIN)/python benchmarks/gpu.py $(if $(PART),--part $(PART)) $(ARGS)
 
 # Files side by side, one per core: tests of one file share what they have trained.
 PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile

@@ -351,7 +351,7 @@ def parse[O: Options](
     return with_parts(options, run={"out": out})
 
 
-def read[O: Options](default: O, argv: Sequence[str], description: str | None) -> O:
+def read[O](default: O, argv: Sequence[str], description: str | None) -> O:
     """A command line, on top of defaults."""
     written = io.StringIO()
     # A line that begins with a sign stays a line of its own.

@@ -1,0 +1,263 @@
+"""Everything that needs a GPU, in parts of a few minutes; each writes a row, and is skipped the next time.
+
+python benchmarks/gpu.py                              # what has no row of this commit and these options
+python benchmarks/gpu.py --part 0                     # demonstrations, to take along; needs no GPU
+python benchmarks/gpu.py --part 4 --prior gaussian past --minutes 15
+python benchmarks/gpu.py --device cpu --smallest      # tries this script, without a GPU
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import throughput
+from tqdm import tqdm
+
+from lab.comparison import EPISODES_PER_JOB, train_all
+from lab.files import ERRORS, PartialFailure, read_lines
+from lab.jobs import Jobs
+from lab.machine import check_device, facts_of_machine
+from lab.options import PRESETS, Options, adapted, check_given, read, script, with_parts
+from lab.policies import Cell, Policy, play, policies_of, row
+from lab.tasks import check_counts
+from lab.timing import Clock
+from warmprior.checks import check_choice, check_positive
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import check_writable, write_atomic
+
+ROOT = Path(__file__).parents[1]
+PROBE, TINY_PROBE = 300, 6
+"""Iterations that tell how many fit into the time, and in the smallest form."""
+
+BEFORE_PLAYING, ALONE = 0.75, 0.9
+"""Shares of a part's time that its trainings take."""
+
+DEMONSTRATIONS = {"state": 100, "image": 6}
+"""Of six operators; with their images they take less than 60 MiB."""
+
+SMALLEST: dict[str, dict[str, Any]] = {
+    "data": {"demonstrations": (3,), "image_size": 32, "fast_rendering": True},
+    "network": {"hidden_dim": 48, "crop_size": 28},
+    "training": {"batch_size": 4},
+    "evaluation": {"episodes": 1},
+}
+
+
+@dataclass(frozen=True)
+class GpuOptions:
+    """Parts to run, their policies, and their time."""
+
+    # 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5 from images (default: all)
+    part: tuple[int, ...] = ()
+    minutes: float | None = None  # that each may take (default: 3 to 7.5)
+    preset: str = "paper"  # of robomimic.py: network and recipe of parts 4 and 5
+    prior: tuple[str, ...] = ("past",)  # their methods, which share the time
+    episodes: int = 20  # of part 4, per method and NFE
+    device: str = "cuda"
+    smallest: bool = False  # tiny trainings on lift, which try this script
+    out: Path = Path("runs/gpu")  # where rows, policies and, without $WARMPRIOR_CACHE, demonstrations lie
+    commit: str | None = None  # of these sources (default: as git says)
+
+    def check(self) -> None:
+        for number in self.part:
+            check_choice("--part", str(number), map(str, PARTS))
+        if self.minutes is not None:
+            check_positive(**{"--minutes": self.minutes})
+        check_choice("--preset", self.preset, PRESETS)
+        check_given(self, "prior")
+        check_counts(self, "episodes")
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Task and style."""
+        return ("lift", "ph") if self.smallest else ("square", "mh")
+
+    @property
+    def probe(self) -> int:
+        return TINY_PROBE if self.smallest else PROBE
+
+    def policies(self, obs: str, iterations: int = 1, first: bool = False) -> tuple[Options, list[Policy]]:
+        """The preset's policies, trained for so many iterations; image encoders begin with random weights."""
+        changes: dict[str, dict[str, Any]] = {
+            "data": {"obs": obs, "demonstrations": (DEMONSTRATIONS[obs],)},
+            "network": {"encoder": "resnet18"},
+            "training": {"iterations": iterations, "checkpoints": 1, "log_every": max(1, self.probe // 3)},
+            "sources": {"prior": self.prior[:1] if first else self.prior},
+            "evaluation": {"seeds": 1, "episodes": self.episodes},
+            "run": {"preset": self.preset, "device": self.device, "compile": self.device != "cpu"},
+        }
+        changes["run"]["out"] = self.out / obs / "run"
+        options = adapted(PRESETS[self.preset], with_parts(PRESETS[self.preset], **changes))
+        options = with_parts(options, **changes)
+        options = with_parts(options, **SMALLEST) if self.smallest else options
+        return options, policies_of(options, self.place, only=True)
+
+
+def inputs(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Read or make the demonstrations of parts 4 and 5."""
+    found = {obs: o.policies(obs)[1][0].task().facts for obs in DEMONSTRATIONS}
+    return {obs: {name: facts[name] for name in ("demonstrations", "steps")} for obs, facts in found.items()}
+
+
+def tests(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Run the tests that are marked `cuda`."""
+    # Only their files: to collect the others takes a minute, and packages that this machine may lack.
+    files = [path for path in (ROOT / "tests").rglob("test_*.py") if "pytest.mark.cuda" in path.read_text()]
+    report = (o.out / "tests.xml").absolute()
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "cuda", f"--junitxml={report}", *map(str, files)]
+    try:
+        code = subprocess.run(command, cwd=ROOT, timeout=seconds, check=False).returncode
+    except subprocess.TimeoutExpired:
+        raise PartialFailure(f"the tests take longer than {seconds / 60:g} minutes: add --minutes") from None
+    if code not in (0, 1):  # all passed, or some failed
+        raise PartialFailure(f"the tests did not run, pytest ended with {code}: see above")
+    cases = list(ElementTree.parse(report).iter("testcase"))
+    failed = [case.get("name") for case in cases if {"failure", "error"} & {part.tag for part in case}]
+    skipped = sum(case.find("skipped") is not None for case in cases)
+    return {"passed": len(cases) - skipped - len(failed), "skipped": skipped, "failed": failed}
+
+
+def clock(o: GpuOptions) -> Clock:
+    return Clock(1 if o.smallest else 11, tqdm(desc="rounds", leave=False, disable=None))
+
+
+def ratios(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Measure the library over bare torch: `cuda_*_over_*` of throughput.py."""
+    names = [name for name in throughput.FIGURES if name.startswith("cuda_") and "_over_" in name]
+    return {name: throughput.FIGURES[name][0](clock(o)) for name in names}
+
+
+def speed(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Measure `cuda_steps_per_second` of throughput.py: of the paper's transformer."""
+    tiny: dict[str, Any] = {"network": throughput.small_network, "batch": 4} if o.smallest else {}
+    return throughput.steps_per_second(clock(o), o.device, **tiny) or {}
+
+
+def train_for(o: GpuOptions, seconds: float, obs: str) -> tuple[Options, list[Policy]]:
+    """Train a policy per method, for as many iterations as a short training says fit."""
+    begun = time.monotonic()
+    shutil.rmtree(o.out / obs, ignore_errors=True)  # of a part that was cut off: its logs would mislead
+    options, probes = o.policies(obs, o.probe, first=True)
+    starts = time.monotonic()
+    train_all(options, probes)
+    rate = iterations_per_second(probes[0])
+    starting = time.monotonic() - starts - o.probe / rate  # a process, its compiler
+    left = seconds - (time.monotonic() - begun)
+    fit = 0 if o.smallest and o.minutes is None else int(rate * (left / len(o.prior) - starting))
+    options, policies = o.policies(obs, max(o.probe, fit))
+    train_all(options, policies)
+    return options, policies
+
+
+def iterations_per_second(policy: Policy) -> float:
+    """The median over the training's log, without its first entry, in which it compiles."""
+    path = policy.run.folder / "logs" / policy.name / "scalars/train/iterations_per_second.csv"
+    return statistics.median(float(line.split(",")[1]) for line in path.read_text().splitlines()[1:])
+
+
+def told(policy: Policy) -> dict[str, Any]:
+    """Return what a training came to."""
+    losses = [loss for _, loss in policy.losses]
+    return {
+        **policy.facts,
+        "batch_size": policy.training.batch_size,
+        "iterations_per_second": iterations_per_second(policy),
+        "first_loss": losses[0],
+        "loss": losses[-1],
+    }
+
+
+def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Train from states, and play."""
+    options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
+    last = policies[0].training.iterations
+    cells = {(p, Cell(last, nfe)): [] for p in policies for nfe in p.method.nfes(options.evaluation.nfe)}
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + options.evaluation.episodes)
+    with Jobs(options.run) as jobs:
+        for ((policy, cell), episodes), i in product(cells.items(), range(0, len(seeds), EPISODES_PER_JOB)):
+            few = seeds[i : i + EPISODES_PER_JOB]
+            name = f"play {policy}, {cell}, from {few[0]}"
+            jobs.submit(name, play, policy, cell, options.evaluation, few, then=episodes.extend)
+        if failures := jobs.wait():
+            raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
+    kept = ("prior", "nfe", "episodes", "successes", "mean_steps")
+    rows = [row(policy, cell, episodes, {}) for (policy, cell), episodes in cells.items()]
+    played = [{name: each[name] for name in kept} for each in rows]
+    return {"trained": [told(policy) for policy in policies], "played": played}
+
+
+def images(o: GpuOptions, seconds: float) -> dict[str, Any]:
+    """Train from the images of two cameras."""
+    return {"trained": [told(policy) for policy in train_for(o, ALONE * seconds, "image")[1]]}
+
+
+PARTS: dict[int, tuple[Callable[[GpuOptions, float], dict[str, Any]], float]] = {
+    0: (inputs, 7.5),
+    1: (tests, 4.0),
+    2: (ratios, 3.0),
+    3: (speed, 3.0),
+    4: (states, 7.5),
+    5: (images, 5.0),
+}
+"""By number: the function, and the minutes that it may take."""
+
+
+def commit_of_sources() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise ValueError("git does not know these sources: name what they are with --commit") from error
+
+
+@script("gpu.py", hint="the same command continues")
+def main(argv: list[str] | None) -> None:
+    o = read(GpuOptions(), sys.argv[1:] if argv is None else argv, __doc__)
+    o.check()
+    parts = sorted(set(o.part or PARTS))
+    if parts != [0]:
+        check_device(o.device)
+    check_writable(o.out)
+    os.environ.setdefault("WARMPRIOR_CACHE", str((o.out / "inputs").absolute()))
+    asked = {name: value for name, value in asdict(o).items() if name not in ("part", "out", "commit")}
+    identity = {"commit": o.commit or commit_of_sources(), "options": json.loads(json.dumps(asked))}
+    path, failures = o.out / "results.jsonl", []
+    rows = read_lines(path) if path.exists() else []
+    for number in parts:
+        work, minutes = PARTS[number]
+        mine = {"part": number, **identity}
+        if any(mine.items() <= found.items() for found in rows):
+            print(f"part {number}, {work.__name__}: done before", flush=True)
+            continue
+        print(f"part {number}, {work.__name__}", flush=True)
+        begun = time.monotonic()
+        try:
+            results = work(o, 60 * (o.minutes or minutes))
+        except ERRORS as error:  # the other parts go on
+            failures.append(f"part {number}, {work.__name__}: {error}")
+            print(f"FAILED {failures[-1]}", flush=True)
+            continue
+        facts = {"seconds": time.monotonic() - begun, **facts_of_machine()}
+        rows.append({**mine, **facts, "results": results})
+        text = "".join(json.dumps(found) + "\n" for found in rows)
+        write_atomic(path, lambda path, text=text: path.write_text(text))
+        print(json.dumps(results), flush=True)
+    print(f"Rows: {path}")
+    if failures:
+        raise PartialFailure("; ".join(failures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
