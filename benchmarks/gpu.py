@@ -15,7 +15,6 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -80,11 +79,6 @@ class GpuOptions:
         check_counts(self, "episodes")
 
     @property
-    def place(self) -> tuple[str, str]:
-        """Task and style."""
-        return ("lift", "ph") if self.smallest else ("square", "mh")
-
-    @property
     def probe(self) -> int:
         return TINY_PROBE if self.smallest else PROBE
 
@@ -96,13 +90,15 @@ class GpuOptions:
             "training": {"iterations": iterations, "checkpoints": 1, "log_every": max(1, self.probe // 3)},
             "sources": {"prior": self.prior[:1] if first else self.prior},
             "evaluation": {"seeds": 1, "episodes": self.episodes},
-            "run": {"preset": self.preset, "device": self.device, "compile": self.device != "cpu"},
+            "run": {"preset": self.preset, "device": self.device, "out": self.out / obs / "run"},
         }
-        changes["run"]["out"] = self.out / obs / "run"
+        changes["run"]["compile"] = self.device != "cpu"
         options = adapted(PRESETS[self.preset], with_parts(PRESETS[self.preset], **changes))
         options = with_parts(options, **changes)
-        options = with_parts(options, **SMALLEST) if self.smallest else options
-        return options, policies_of(options, self.place, only=True)
+        if self.smallest:
+            options = with_parts(options, **SMALLEST)
+        place = ("lift", "ph") if self.smallest else ("square", "mh")
+        return options, policies_of(options, place, only=True)
 
 
 def inputs(o: GpuOptions, seconds: float) -> dict[str, Any]:
@@ -120,7 +116,7 @@ def tests(o: GpuOptions, seconds: float) -> dict[str, Any]:
     try:
         code = subprocess.run(command, cwd=ROOT, timeout=seconds, check=False).returncode
     except subprocess.TimeoutExpired:
-        raise PartialFailure(f"the tests take longer than {seconds / 60:g} minutes: add --minutes") from None
+        raise PartialFailure(f"the tests take more than {seconds / 60:g} minutes: add --minutes") from None
     if code not in (0, 1):  # all passed, or some failed
         raise PartialFailure(f"the tests did not run, pytest ended with {code}: see above")
     cases = list(ElementTree.parse(report).iter("testcase"))
@@ -169,14 +165,9 @@ def iterations_per_second(policy: Policy) -> float:
 
 def told(policy: Policy) -> dict[str, Any]:
     """Return what a training came to."""
-    losses = [loss for _, loss in policy.losses]
-    return {
-        **policy.facts,
-        "batch_size": policy.training.batch_size,
-        "iterations_per_second": iterations_per_second(policy),
-        "first_loss": losses[0],
-        "loss": losses[-1],
-    }
+    (_, first), *_, (_, last) = policy.losses
+    found = {"iterations_per_second": iterations_per_second(policy), "first_loss": first, "loss": last}
+    return {**policy.facts, "batch_size": policy.training.batch_size, **found}
 
 
 def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
@@ -188,12 +179,12 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     with Jobs(options.run) as jobs:
         for ((policy, cell), episodes), i in product(cells.items(), range(0, len(seeds), EPISODES_PER_JOB)):
             few = seeds[i : i + EPISODES_PER_JOB]
-            name = f"play {policy}, {cell}, from {few[0]}"
-            jobs.submit(name, play, policy, cell, options.evaluation, few, then=episodes.extend)
+            work = play, policy, cell, options.evaluation, few
+            jobs.submit(f"play {policy}, {cell}, from {few[0]}", *work, then=episodes.extend)
         if failures := jobs.wait():
             raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
     kept = ("prior", "nfe", "episodes", "successes", "mean_steps")
-    rows = [row(policy, cell, episodes, {}) for (policy, cell), episodes in cells.items()]
+    rows = (row(policy, cell, episodes, {}) for (policy, cell), episodes in cells.items())
     played = [{name: each[name] for name in kept} for each in rows]
     return {"trained": [told(policy) for policy in policies], "played": played}
 
@@ -203,14 +194,9 @@ def images(o: GpuOptions, seconds: float) -> dict[str, Any]:
     return {"trained": [told(policy) for policy in train_for(o, ALONE * seconds, "image")[1]]}
 
 
-PARTS: dict[int, tuple[Callable[[GpuOptions, float], dict[str, Any]], float]] = {
-    0: (inputs, 7.5),
-    1: (tests, 4.0),
-    2: (ratios, 3.0),
-    3: (speed, 3.0),
-    4: (states, 7.5),
-    5: (images, 5.0),
-}
+PARTS = dict(
+    enumerate([(inputs, 7.5), (tests, 4.0), (ratios, 3.0), (speed, 3.0), (states, 7.5), (images, 5.0)])
+)
 """By number: the function, and the minutes that it may take."""
 
 
@@ -237,16 +223,16 @@ def main(argv: list[str] | None) -> None:
     rows = read_lines(path) if path.exists() else []
     for number in parts:
         work, minutes = PARTS[number]
-        mine = {"part": number, **identity}
-        if any(mine.items() <= found.items() for found in rows):
-            print(f"part {number}, {work.__name__}: done before", flush=True)
+        mine, name = {"part": number, **identity}, f"part {number}, {work.__name__}"
+        done = any(mine.items() <= found.items() for found in rows)
+        print(f"{name}: done before" if done else name, flush=True)
+        if done:
             continue
-        print(f"part {number}, {work.__name__}", flush=True)
         begun = time.monotonic()
         try:
             results = work(o, 60 * (o.minutes or minutes))
         except ERRORS as error:  # the other parts go on
-            failures.append(f"part {number}, {work.__name__}: {error}")
+            failures.append(f"{name}: {error}")
             print(f"FAILED {failures[-1]}", flush=True)
             continue
         facts = {"seconds": time.monotonic() - begun, **facts_of_machine()}
