@@ -34,9 +34,9 @@ def main(argv: list[str] | None) -> None:
         seeds = per_seed(labelled(rows, "chunk"), options.evaluation.top_k)
         seeds = seeds.sort_values(["chunk", "nfe"], ascending=[True, False], kind="stable")
         lines = {"success": "success rate", JUMPS: "jump at boundaries (dotted: inside)"}
-        problems = dict(list(seeds.groupby("problem", sort=False)))
-        for name, mine in problems.items():
-            end = f"_{slug(name)}" if len(problems) > 1 else ""
+        settings = dict(list(seeds.groupby("setting", sort=False)))
+        for name, mine in settings.items():
+            end = f"_{slug(name)}" if len(settings) > 1 else ""
             plot_lines(mine, out / f"chunk_lengths{end}.png", name, "chunk", lines)
         # All tasks beside each other, at the fewest network evaluations.
         fewest, shortest = at_fewest(seeds), min(seeds.chunk)
@@ -45,8 +45,8 @@ def main(argv: list[str] | None) -> None:
         bars = {"success": "success rate"}
         plot_bars(pair.assign(chunk="H = " + pair.chunk.astype(str)), out / "bars.png", title, "chunk", bars)
         short = fewest[fewest.chunk == shortest]
-        plot_success(short, out / "violins.png", f"{title}, H = {shortest}", group="problem")
-        text = table(seeds, ["problem", "chunk", "nfe", "method"], ["success", *JUMPS])
+        plot_success(short, out / "violins.png", f"{title}, H = {shortest}", group="setting")
+        text = table(seeds, ["setting", "chunk", "nfe", "method"], ["success", *JUMPS])
         write_report(out, text, text, rows, failures)
 
 

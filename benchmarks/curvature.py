@@ -17,7 +17,7 @@ from lab.options import PRESETS, FinishedRun, MeasuredOptions, parse, script, st
 from lab.paper import paper_curvature
 from lab.plots import plot_flow_paths
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
-from lab.report import labelled, pooled, problem_title, table, write_report
+from lab.report import labelled, pooled, setting_title, table, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
 
 
@@ -68,7 +68,7 @@ def main(argv: list[str] | None) -> None:
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
         seeds = rows.seed.dropna().nunique()
         notes = [
-            f"{problem_title(task)}, {len(observations)} observations of {source}, {seeds} seed(s). In "
+            f"{setting_title(task)}, {len(observations)} observations of {source}, {seeds} seed(s). In "
             "brackets: 95% bootstrap intervals over episodes.",
             "The paper says neither which mean it uses, nor whether it counts a prediction of 2H whole.",
             "Curvature shrinks with the length of the transport. Divided by the squared mean velocity, it "

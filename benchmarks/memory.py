@@ -47,7 +47,7 @@ def main(argv: list[str] | None) -> None:
     axis.set_ylabel("success over the first method (points)")
     save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
 
-    text = table(found, ["problem", "nfe", "method"], ["memory_gain", "gain"])
+    text = table(found, ["setting", "nfe", "method"], ["memory_gain", "gain"])
     print(text, f"\nPicture: {args.out}", sep="")
 
 

@@ -41,7 +41,7 @@ from lab.options import (
 )
 from lab.plots import plot_lines, plot_success
 from lab.policies import slug, write_rows
-from lab.report import labelled, problem_title, table, write_report
+from lab.report import labelled, setting_title, table, write_report
 from lab.rows import AGENT, read_rows
 from lab.tasks import DataOptions
 from warmprior import WarmPriorActor
@@ -199,7 +199,7 @@ def main(argv: list[str] | None) -> None:
         found = labelled(write_rows(path, rows))
         if found.groupby("method")["delta"].nunique().max() > 1:
             found["method"] += ", delta " + found.delta.map("{:g}".format)
-        title = f"{problem_title(task)}, NFE {options.evaluation.nfe[0]}"
+        title = f"{setting_title(task)}, NFE {options.evaluation.nfe[0]}"
         draw(found, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]
         last = found.groupby([*agents, "seed"], sort=False).tail(1)

@@ -5,7 +5,7 @@ python benchmarks/real_time_chunking.py --toy alone         # minutes
 python benchmarks/real_time_chunking.py --task can stack --toy no --preset cpu
 python benchmarks/real_time_chunking.py --resume            # after an interruption
 
-While a chunk is computed, the one before is executed. Base, WP-Past and WP-Preview are played as they
+While a chunk is computed, the one before is executed. The Gaussian source, WP-Past and WP-Preview are played as they
 are, and guided by Real-Time Chunking, with the same decisions per second at every delay. The policies
 of robomimic.py with the same options are used, not trained again.
 """
@@ -110,7 +110,7 @@ def main(argv: list[str] | None) -> None:
         guidance = ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
         notes = [f"{seeds.execute.iloc[0]} actions per decision at every delay. RTC: {guidance}."]
         names = ["success", "boundary_jump", "inner_jump"]
-        text = table(seeds, ["problem", "nfe", "delay", "method"], names, notes)
+        text = table(seeds, ["setting", "nfe", "delay", "method"], names, notes)
         write_report(out, text, text, rows, failures)
 
 

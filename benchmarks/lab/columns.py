@@ -37,7 +37,7 @@ IDENTITY = tuple(_COMPARED)
 """The columns that say which row it is: no two rows of a file agree in all of them."""
 
 COLUMNS: dict[str, tuple[str, str]] = {
-    "problem": ("", "task and style in words"),
+    "setting": ("", "task and style in words"),
     "method": ("", "the source in words, with its options; sigma and H where several are compared"),
     **_COMPARED,
     "observations": ("d", "observations that the measure is the mean of"),

@@ -128,7 +128,7 @@ class Composition:
 
 
 METHODS: dict[str, Composition] = {
-    "gaussian": Composition("Base", "#7f7f7f"),
+    "gaussian": Composition("Gaussian source", "#7f7f7f"),
     "past": Composition("WP-Past", "#1f77b4", PastPrior),
     "preview": Composition("WP-Preview", "#d95f02", PreviewPrior),
     "forecast": Composition("WP-Forecast", "#d62728", ForecastPrior),

@@ -128,7 +128,7 @@ def plot_bars(
     title: str,
     group: str,
     measures: Mapping[str, str],
-    column: str = "problem",
+    column: str = "setting",
 ) -> None:
     """Means over seeds as bars with their deviation: a line of panels per measure, a panel per `column`.
 

@@ -47,7 +47,7 @@ def text_of(row: Mapping[str, Any], name: str) -> str:
     return value if isinstance(value, str) else ""
 
 
-def problem_title(row: Mapping[str, Any]) -> str:
+def setting_title(row: Mapping[str, Any]) -> str:
     """Task and style, with actions and observations where they are not the usual ones."""
     spaces = ((text_of(row, "actions"), "actions"), (text_of(row, "obs"), "observations"))
     title = f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
@@ -55,13 +55,13 @@ def problem_title(row: Mapping[str, Any]) -> str:
 
 
 def labelled(rows: DataFrame, *apart: str) -> DataFrame:
-    """The rows with their `method` and `problem` in words.
+    """The rows with their `method` and `setting` in words.
 
     Sigma and H belong to the name of a method where several occur, unless a table has them `apart`.
     """
     sigmas = rows.groupby("prior")["sigma"].transform("nunique") > 1
     several = "chunk" not in apart and rows["chunk"].nunique() > 1
-    methods, problems = [], []
+    methods, settings = [], []
     for row, by_sigma in zip(rows.to_dict("records"), sigmas, strict=True):
         guided = text_of(row, "guidance") == "rtc"
         parts = [label(row["prior"], text_of(row, "options"))]
@@ -70,8 +70,8 @@ def labelled(rows: DataFrame, *apart: str) -> DataFrame:
         parts += ["around zero"] if text_of(row, "centre") == "zero" else []
         parts += [f"sigma {row['sigma']:g}"] if by_sigma and "sigma" not in apart else []
         methods.append(", ".join([*parts, *([f"H {row['chunk']}"] if several else [])]))
-        problems.append(problem_title(row) if text_of(row, "task") else "")
-    return rows.assign(method=methods, problem=problems)
+        settings.append(setting_title(row) if text_of(row, "task") else "")
+    return rows.assign(method=methods, setting=settings)
 
 
 def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
@@ -113,10 +113,10 @@ def pooled(rows: DataFrame) -> DataFrame:
 
 
 def summary(rows: DataFrame, top_k: int) -> DataFrame:
-    """All that is known per problem, method (delay) and NFE, beside the first method's."""
+    """All that is known per setting, method (delay) and NFE, beside the first method's."""
     seeds = per_seed(labelled(rows), top_k)
     seeds = seeds.assign(**seeds.reindex(columns=[*RELATIVE, *BOUNDS, "memory_gain"]).astype(float))
-    keys = [name for name in ("problem", "method", "delay", "nfe", "temperature") if name in seeds]
+    keys = [name for name in ("setting", "method", "delay", "nfe", "temperature") if name in seeds]
     groups = seeds.groupby(keys, sort=False)
     counted = {
         *keys,
@@ -168,9 +168,9 @@ def _beside(found: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFram
         for won, lost in found[["won", "lost"]].to_numpy()
     ]
     # A flow is the same at any NFE, and the baseline may lack this one.
-    flows = seeds[seeds["method"] == first].groupby("problem")[RELATIVE].mean()
+    flows = seeds[seeds["method"] == first].groupby("setting")[RELATIVE].mean()
     for name in RELATIVE:
-        found[f"{name}_ratio"] = found[name] / found["problem"].map(flows[name]).replace(0.0, math.nan)
+        found[f"{name}_ratio"] = found[name] / found["setting"].map(flows[name]).replace(0.0, math.nan)
     return found
 
 
@@ -227,7 +227,7 @@ def wide(found: DataFrame, cells: Series, index: str, columns: str) -> DataFrame
 def _placed(found: DataFrame) -> DataFrame:
     """A summary with the `place` where methods compare, and the `text` of a success with its gain."""
     delay = ", delay " + found["delay"].astype(str) if "delay" in found else ""
-    found = found.assign(place=found["problem"] + delay, column="NFE " + found["nfe"].astype(str))
+    found = found.assign(place=found["setting"] + delay, column="NFE " + found["nfe"].astype(str))
     if "temperature" in found and found.groupby("method")["temperature"].nunique().max() > 1:
         found["column"] += ", noise x " + found["temperature"].map("{:g}".format)
     best = found.groupby(["place", "column"])["success"].transform("max")
@@ -257,9 +257,9 @@ def _experiment(found: DataFrame, top_k: int) -> str:
 def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
     """Three lines: the experiment, the best methods, and how sure it is that they beat the first.
 
-    Over several problems it averages success and pools episodes.
+    Over several settings it averages success and pools episodes.
     """
-    first, problems = found["method"].iloc[0], found["problem"].unique()
+    first, settings = found["method"].iloc[0], found["setting"].unique()
     best, chances = [], []
     sums = {"success": "mean", "successes": "sum", "episodes": "sum", "task": "size"}
     for nfe, group in _placed(found).sort_values("nfe", ascending=False).groupby("column", sort=False):
@@ -274,7 +274,7 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
             gain = totals.loc[name, "success"] - totals.loc[first, "success"]
             chance = probability_better(*counts)
             chances.append(f"{name} {gain:+.1%}, {chance:.2f} at {nfe}")
-    where = f"{len(problems)} problems ({', '.join(problems)})" if len(problems) > 1 else problems[0]
+    where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
     lines = [
         f"{_count(found['method'].nunique(), 'method')} on {where}: {_experiment(found, top_k)}.",
         f"Best success: {'; '.join(best)}.",
@@ -284,7 +284,7 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
 
 
 def terminal_table(found: DataFrame, top_k: int, width: int = 120) -> str:
-    """The headline, then a line per problem and method with a column per NFE."""
+    """The headline, then a line per setting and method with a column per NFE."""
     rows, first = _placed(found), found["method"].iloc[0]
     several = rows["place"].nunique() > 1
     rows["line"] = rows["place"] + ", " + rows["method"] if several else rows["method"]
@@ -319,7 +319,7 @@ def success_report(found: DataFrame, top_k: int, notes: Sequence[str] = (), sour
             "The paper used the official human demonstrations, and we used others. Compare gains within a "
             "row, not numbers across rows."
         )
-    keys = [name for name in ("problem", "delay", "nfe", "temperature", "method") if name in found]
+    keys = [name for name in ("setting", "delay", "nfe", "temperature", "method") if name in found]
     return f"{markdown(frame, listed)}\n{table(found, keys, SHOWN)}"
 
 

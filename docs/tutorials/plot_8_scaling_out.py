@@ -92,7 +92,7 @@ sources = {"gaussian": "#7f7f7f", "past": "#1f77b4"}
 for place, (name, color) in enumerate(sources.items()):
     rates = [row["collision_rate"] for row in more if row["prior"] == name]
     axis.plot(rates, [place] * len(rates), "o", color=color, ms=8)
-axis.set_yticks([0, 1], ["Base", "WP-Past"])
+axis.set_yticks([0, 1], ["Gaussian source", "WP-Past"])
 axis.set(xlabel="episodes that collide, NFE 3", xlim=(-0.03, 1.03))
 axis.set(ylim=(-0.5, 1.5), title="Three training seeds of each source")
 plt.show()

@@ -66,7 +66,7 @@ def lines_of(text):
     return [dict(zip(found[start], line, strict=True)) for line in found[start + 2 :]]
 
 
-def test_methods_and_problems_have_names_that_differ():
+def test_methods_and_settings_have_names_that_differ():
     rows = [
         row(guidance="rtc", task="tool_hang"),
         row(prior="past", options="correlation=0.5", actions="absolute", chunk=4),
@@ -75,8 +75,8 @@ def test_methods_and_problems_have_names_that_differ():
     found = report.labelled(pd.DataFrame(rows), "chunk")
     methods = ["RTC", "WP-Past, correlation=0.5, sigma 0.5", "RTC + WP-Past, sigma 1"]
     assert list(found["method"]) == methods
-    problems = ["Tool-Hang-PH", "Square-PH, absolute actions", "Square-PH, image observations"]
-    assert list(found["problem"]) == problems
+    settings = ["Tool-Hang-PH", "Square-PH, absolute actions", "Square-PH, image observations"]
+    assert list(found["setting"]) == settings
 
 
 @pytest.mark.parametrize("top_k", [1, 2, 3])
@@ -151,7 +151,7 @@ def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
 
 def test_the_report_has_the_layout_of_table_1():
     text = table(compared(), source="scripted", notes=["A note."])
-    assert text.startswith("| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |")
+    assert text.startswith("| Success rate (%) | NFE 1: Gaussian source | NFE 1: WP-Past | NFE 1: WP-Preview |")
     assert cells_of(text, "Square-PH, measured (scr") == ["50.0", "**80.0** (+30.0*)", "50.0 (+0.0)"]
     assert cells_of(text, "Square-PH, paper") == [f"{rate}" for rate in SUCCESS["square", "ph", "state"][-3:]]
     counts = [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
@@ -179,7 +179,7 @@ def test_the_terminal_table_fits_and_says_first_what_came_out():
     found = report.summary(pd.concat([compared(), pd.DataFrame(rows)], ignore_index=True), 1)
     facts, best, sure, empty, *_ = report.terminal_table(found, 1).splitlines()
     assert facts.endswith("H = 8, 3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed.")
-    assert best == "Best success: Base 60.0% at NFE 9; WP-Past 80.0% at NFE 1." and empty == ""
+    assert best == "Best success: Gaussian source 60.0% at NFE 9; WP-Past 80.0% at NFE 1." and empty == ""
     said = re.findall(r"(\S+ [+-]\d+\.\d%), (\S+) at NFE (\d)", sure)
     chance = {(one["prior"], one["nfe"]): one["better"] for _, one in found.iterrows()}
     assert [(gain, nfe) for gain, _, nfe in said] == [("WP-Preview -10.0%", "9"), ("WP-Past +30.0%", "1")]
@@ -212,9 +212,9 @@ def test_a_table_has_the_mean_and_deviation_of_every_group_in_the_order_of_the_r
     names = ["success_rate", "switch_rate", "collision_rate", "jerk"]
     nine, one = lines_of(report.table(rows, ["method", "nfe"], names, ["A note."]))
     assert list(nine) == ["method", "nfe", *names[:3]]  # nobody has a jerk
-    expected = ["Base", "9", "50.0% ± 0.0%", "0.500 (1 not finite)", "0.300 ± 0.071"]  # 0.1 / sqrt(2)
+    expected = ["Gaussian source", "9", "50.0% ± 0.0%", "0.500 (1 not finite)", "0.300 ± 0.071"]  # 0.1 / sqrt(2)
     assert list(nine.values()) == expected
-    assert list(one.values()) == ["Base", "1", "50.0%", "0.500", "0.100"]
+    assert list(one.values()) == ["Gaussian source", "1", "50.0%", "0.500", "0.100"]
 
 
 def test_a_training_is_shown_by_its_best_checkpoints():
@@ -251,4 +251,4 @@ def test_a_temperature_is_a_column_and_compares_with_its_own():
     assert found.loc[("past", 1.0), "gain"] == pytest.approx(0.1)
     assert found.loc[("past", 0.5), "gain"] == pytest.approx(0.7)
     text = table(pd.DataFrame(rows))
-    assert "NFE 1, noise x 1: Base" in text and "NFE 1, noise x 0.5: WP-Past" in text
+    assert "NFE 1, noise x 1: Gaussian source" in text and "NFE 1, noise x 0.5: WP-Past" in text
