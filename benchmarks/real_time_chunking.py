@@ -5,8 +5,8 @@ python benchmarks/real_time_chunking.py --toy alone         # minutes
 python benchmarks/real_time_chunking.py --task can stack --toy no --preset cpu
 python benchmarks/real_time_chunking.py --resume            # after an interruption
 
-While a chunk is computed, the one before is executed. The Gaussian source, WP-Past and WP-Preview are played as they
-are, and guided by Real-Time Chunking, with the same decisions per second at every delay. The policies
+While a chunk is computed, the one before is executed. Three sources are played as they are, and guided by
+Real-Time Chunking, with the same decisions per second at every delay. The policies
 of robomimic.py with the same options are used, not trained again.
 """
 
