@@ -12,7 +12,7 @@ GROOT_NEEDS := tests/lerobot/groot_n15.txt
 CHECK_PYTHON := $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
 	{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
 
-.PHONY: install benchmark throughput gpu test test-slow test-groot-n15 latest lint fuzz results docs clean
+.PHONY: install benchmark throughput gpu test test-slow test-core test-groot-n15 latest lint fuzz results docs dist clean
 
 install: .venv/installed
 
@@ -51,6 +51,14 @@ test: install
 test-slow: install
 	$(PYTEST) -m slow $(ARGS)
 
+# The core alone, without simulator and extras, on any system.
+CORE := .venv-core
+test-core:
+	@$(CHECK_PYTHON)
+	$(PYTHON) -m venv $(CORE)
+	$(CORE)/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(CORE)/bin/python -m pytest -n logical --dist loadfile $(ARGS)
+
 $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 	$(PYTHON) -m venv $(GROOT)
 	$(GROOT)/bin/python -m pip install --quiet --upgrade pip
@@ -88,5 +96,15 @@ results: install
 docs: install
 	$(BIN)/sphinx-build -W -q -b html -d build/doctrees $(ARGS) docs docs/_build
 
+# Wheel and sdist of the library and of the plugin, in dist/. A release is the tag v and the version: make dist TAG=v0.2.0.
+VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+dist:
+	@test "$(or $(TAG),v$(VERSION))" = "v$(VERSION)" || \
+		{ echo "the tag $(TAG) is not v$(VERSION), the version in pyproject.toml"; exit 1; }
+	$(PYTHON) -m venv build/dist
+	build/dist/bin/python -m pip install --quiet "hatchling>=1.25"
+	build/dist/bin/python -m hatchling build -d dist
+	cd $(PLUGIN) && $(CURDIR)/build/dist/bin/python -m hatchling build -d $(CURDIR)/dist
+
 clean:
-	rm -rf .venv $(GROOT) $(LATEST) docs/_build docs/auto_tutorials build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv $(CORE) $(GROOT) $(LATEST) docs/_build docs/auto_tutorials build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

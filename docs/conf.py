@@ -3,7 +3,7 @@
 import re
 import sys as _sys
 from functools import cache as _cache
-from importlib.metadata import version as _version
+from importlib.metadata import metadata as _metadata
 from pathlib import Path as _Path
 
 from furo.navigation import get_navigation_tree
@@ -16,7 +16,9 @@ _sys.path.insert(0, str(_Path(__file__).parent))  # tutorial_state
 project = "warmprior"
 author = "the warmprior developers"
 copyright = "2026, the warmprior developers. MIT licence"
-release = version = _version("warmprior")
+_package = _metadata("warmprior")
+release = version = _package["Version"]
+_urls = dict(each.split(", ") for each in _package.get_all("Project-URL") or ())
 
 extensions = [
     "myst_parser",
@@ -35,6 +37,11 @@ html_theme = "furo"
 smartquotes = False  # options and messages are to be copied
 html_title = "warmprior"
 html_static_path = ["_static"]
+html_theme_options = {
+    "source_repository": _urls.get("Repository", ""),
+    "source_branch": "main",
+    "source_directory": "docs/",
+}
 html_favicon = "_static/favicon.svg"
 html_css_files = ["pages.css"]
 # Pictures come with the pages that show them, and not with the static files a second time.
