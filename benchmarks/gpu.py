@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -174,7 +175,9 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Train from states, and play."""
     options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
     last = policies[0].training.iterations
-    cells = {(p, Cell(last, nfe)): [] for p in policies for nfe in p.method.nfes(options.evaluation.nfe)}
+    cells: dict[tuple[Policy, Cell], list[Any]] = {
+        (p, Cell(last, nfe)): [] for p in policies for nfe in p.method.nfes(options.evaluation.nfe)
+    }
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + options.evaluation.episodes)
     with Jobs(options.run) as jobs:
         for ((policy, cell), episodes), i in product(cells.items(), range(0, len(seeds), EPISODES_PER_JOB)):
@@ -238,7 +241,7 @@ def main(argv: list[str] | None) -> None:
         facts = {"seconds": time.monotonic() - begun, **facts_of_machine()}
         rows.append({**mine, **facts, "results": results})
         text = "".join(json.dumps(found) + "\n" for found in rows)
-        write_atomic(path, lambda path, text=text: path.write_text(text))
+        write_atomic(path, partial(Path.write_text, data=text))
         print(json.dumps(results), flush=True)
     print(f"Rows: {path}")
     if failures:

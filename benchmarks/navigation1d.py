@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pandas as pd
 import torch
@@ -92,7 +93,8 @@ def main(argv: list[str] | None) -> None:
         style = "position" if options.position_only else "toy"
         policies = policies_of(options, ("navigation", style), only=True)
         train_all(options, policies)
-        played = {"rollouts": options.evaluation.episodes, "make_env": policies[0].task().make_env}
+        make_env = policies[0].task().make_env
+        played: dict[str, Any] = {"rollouts": options.evaluation.episodes, "make_env": make_env}
         judged = [
             {**p.facts, "nfe": nfe, **judge_navigation(p.load(), p.training.seed, nfe=nfe, **played)}
             for p in policies
@@ -128,7 +130,7 @@ def main(argv: list[str] | None) -> None:
                 said[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {said[0]}"
             if method.remembers:
                 said.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
-            rollout = play_navigation(actor, seed, nfe=nfe, make_env=played["make_env"])
+            rollout = play_navigation(actor, seed, nfe=nfe, make_env=make_env)
             panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), said)
             if method.is_flow:
                 # One window of a demonstration, above the first obstacle, from many source samples.

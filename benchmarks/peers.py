@@ -50,7 +50,7 @@ from warmprior.io.script import run_script
 
 VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
 
-Batch = TensorDictBase
+type Batch = TensorDictBase
 
 
 @dataclass
@@ -178,14 +178,15 @@ def lerobot_multi_task_dit(width: int, device: str) -> Peer:
     from transformers import CLIPTextConfig
 
     # Its own comes with weights from a hub; this one is two layers of width 32, with random ones.
-    small = CLIPTextConfig(
-        vocab_size=64,
-        hidden_size=32,
-        intermediate_size=64,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        eos_token_id=2,
-    )
+    sizes: dict[str, Any] = {
+        "vocab_size": 64,
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "eos_token_id": 2,
+    }
+    small = CLIPTextConfig(**sizes)
     encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
     flow = {"objective": "flow_matching", "hidden_dim": width}
     with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):

@@ -36,7 +36,7 @@ def make_env(relative: bool = False) -> EnvBase:
     import gymnasium
 
     name, seen = "gym_pusht/PushT-v0", "environment_state_agent_pos"
-    env = gymnasium.make(name, obs_type=seen, render_mode="rgb_array")
+    env: Any = gymnasium.make(name, obs_type=seen, render_mode="rgb_array")
     if relative:
         offsets, base = gymnasium.spaces.Box(-SIDE, SIDE, (2,)), env.unwrapped
         env = gymnasium.wrappers.TransformAction(env, lambda a: a + np.array(base.agent.position), offsets)

@@ -161,7 +161,7 @@ def plot_lines(
     path: str | Path,
     title: str,
     x: str,
-    measures: Mapping[str | tuple[str, str], str],
+    measures: Mapping[Any, str],
     column: str = "nfe",
     scale: str = "even",
 ) -> None:

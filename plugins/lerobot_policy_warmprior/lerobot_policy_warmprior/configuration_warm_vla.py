@@ -42,7 +42,8 @@ class WarmConfigMixin:
     def make_prior(self) -> Prior:
         """The source distribution; a ``ValueError`` if there is none of that name and these options."""
         kind = registered(Prior, self.prior.partition(",")[0], OWN_PRIORS)
-        room = len(super().action_delta_indices) // kind.prediction_chunks
+        chunk = super().action_delta_indices  # type: ignore[misc]  # LeRobot's configuration has it
+        room = len(chunk) // kind.prediction_chunks
         return build(kind, self.prior, room if self.prior_chunk is None else self.prior_chunk)
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
@@ -55,7 +56,7 @@ class WarmConfigMixin:
     @property
     def action_delta_indices(self) -> list[int]:
         """Steps that LeRobot loads of every action: the history, and the chunk."""
-        chunk = super().action_delta_indices
+        chunk = super().action_delta_indices  # type: ignore[misc]
         return history_indices(self.make_prior().history_length, len(chunk))
 
 

@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -18,7 +19,7 @@ from torch import Tensor
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
 from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
-from warmprior import PreconditionedNetwork, keys
+from warmprior import PreconditionedNetwork, VelocityNetwork, keys
 from warmprior.envs import TASKS
 from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
@@ -63,7 +64,8 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
             f"source, and the policy has (solver, grid, guidance, start)={sampler}: change it first, as by "
             "actor.replace(solver='euler', grid='uniform', guidance=None, start=None), and save it"
         )
-    prior, network, normalizer = actor.prior, actor.network, actor.normalizer
+    prior, network, normalizer = actor.prior, cast(VelocityNetwork, actor.network), actor.normalizer
+    assert normalizer is not None
     spec = next((t for t in TASKS.values() if t.env_name == environment_name(actor)), None)
     objects = 0 if spec is None else spec.object_dim
     widths = [objects, network.observation_dim - objects]
@@ -93,8 +95,8 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     )
     policy = WarmFlowPolicy(config)
     with torch.no_grad():
-        policy.actor.network.load_state_dict(network.state_dict())
-    policy.save_pretrained(out)
+        cast(VelocityNetwork, policy.actor.network).load_state_dict(network.state_dict())
+    policy.save_pretrained(out)  # type: ignore[operator]  # LeRobot hides its type
     for pipeline in make_warm_flow_pre_post_processors(config, stats):
         pipeline.save_pretrained(out)
     return out

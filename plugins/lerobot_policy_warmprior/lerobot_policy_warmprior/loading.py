@@ -113,7 +113,7 @@ class WholePolicy(nn.Module):
             check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
         misfit: str | None
         try:
-            policy = super().from_pretrained(place, config=config, **kwargs)
+            policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
             misfit = policy._misfit
         except RuntimeError as error:
             if "state_dict" not in str(error):

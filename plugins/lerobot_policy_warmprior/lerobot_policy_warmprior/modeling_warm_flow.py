@@ -6,7 +6,7 @@ import gc
 import json
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode
@@ -62,6 +62,10 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
 
     config_class = WarmFlowConfig
     name = "warm_flow"
+    config: WarmFlowConfig
+    _memory: ActionMemory
+    _fitted: dict[str, Tensor]
+    _queues: dict[str, deque[Tensor]]
 
     def __init__(
         self, config: WarmFlowConfig, *, dataset_meta: Any = None, dataset_stats: Any = None
@@ -81,9 +85,14 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         width = sum(self._widths[name] for name in config.observed)
         self._cameras, encoder = list(config.image_features), None
         if self._cameras:
-            size = {"image_size": config.image_size, "crop_size": config.crop_size}
             backbone, _, pretrained = config.encoder.partition("-")
-            encoder = ImageEncoder(self._cameras, width, backbone=backbone, **size)
+            encoder = ImageEncoder(
+                self._cameras,
+                width,
+                backbone=cast(Any, backbone),  # which the configuration has checked
+                image_size=config.image_size,
+                crop_size=config.crop_size,
+            )
             # A saved policy has its weights in its file.
             if pretrained and dataset_meta is not None and not config.pretrained_path:
                 load_imagenet(encoder)
@@ -171,7 +180,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
 
     def get_optim_params(self) -> Any:
         """Weights that decay, and those that do not."""
-        return self.actor.network.parameter_groups(self.config.optimizer_weight_decay)
+        return cast(VelocityNetwork, self.actor.network).parameter_groups(self.config.optimizer_weight_decay)
 
     def reset(self) -> None:
         """New episodes in all environments."""

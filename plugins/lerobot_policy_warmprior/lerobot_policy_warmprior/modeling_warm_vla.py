@@ -60,7 +60,7 @@ class WarmPolicyMixin(WholePolicy):
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of every environment."""
         check_known("select_action", kwargs, ["noise"])
-        return self.warm_adapter.select_action(batch, super().select_action, **kwargs)
+        return self.warm_adapter.select_action(batch, super().select_action, **kwargs)  # type: ignore[misc]
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """A new chunk; ``executed_steps=`` tells how much of the last one was executed.
@@ -75,12 +75,12 @@ class WarmPolicyMixin(WholePolicy):
                 "with --inference.rtc.enabled=false chunks are executed one after the other, however late, "
                 "so what was executed is not known: turn it on, or take --inference.type=sync"
             )
-        predict = super().predict_action_chunk
+        predict = super().predict_action_chunk  # type: ignore[misc]
         return self.warm_adapter.predict_action_chunk(batch, executed, predict, **kwargs)
 
     def reset(self) -> None:
         """New episodes in all environments."""
-        super().reset()
+        super().reset()  # type: ignore[misc]
         if self.warm_adapter is not None:
             self.warm_adapter.forget()
 

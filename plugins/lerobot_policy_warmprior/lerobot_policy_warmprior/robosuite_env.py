@@ -21,7 +21,10 @@ from warmprior.envs.tasks import get_task
 class RobosuiteGymEnv(gymnasium.Env):
     """One environment of :class:`~warmprior.envs.RobosuiteEnv`; see ``RobosuiteEnvConfig`` for options."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # Gymnasium annotates no class variable
+        "render_modes": ["rgb_array"],
+        "render_fps": 20,
+    }
 
     def __init__(
         self,
@@ -37,6 +40,7 @@ class RobosuiteGymEnv(gymnasium.Env):
             options |= {"camera": list(cameras), "from_pixels": True}
         self._env = RobosuiteEnv(task, **options)
         spec = self._env.task
+        assert spec is not None  # a task by its name has one
         self.task = self.task_description = spec.name
         self._object_dim, self._cameras = spec.object_dim, list(cameras)
         self._max_episode_steps = spec.horizon(style) if horizon is None else horizon
@@ -119,7 +123,7 @@ class RobosuiteEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         task = get_task(self.task)
         state = task.observation_dim - task.object_dim
-        entries = {
+        entries: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
             "action": (FeatureType.ACTION, (task.action_dim,)),
             "agent_pos": (FeatureType.STATE, (state,)),
         }
@@ -150,6 +154,7 @@ class RobosuiteEnvConfig(EnvConfig):
         """One batch of environments; in worker processes, they need not know of any registry."""
         make = partial(RobosuiteGymEnv, **self.gym_kwargs)
         options: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+        batch: gymnasium.vector.VectorEnv
         if use_async_envs and n_envs > 1:
             batch = gymnasium.vector.AsyncVectorEnv([make] * n_envs, context="forkserver", **options)
         else:
