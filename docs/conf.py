@@ -79,13 +79,13 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "show_signature": False,
     "download_all_examples": False,
-    "notebook_extensions": set(),
+    "notebook_extensions": {".py"},
     "capture_repr": ("_repr_html_",),
 }
 
 
-def _one_download(app, docname, source):
-    """Leave one link to a tutorial's script, the one below it."""
+def _few_downloads(app, docname, source):
+    """Leave the links to a tutorial's script and notebook, which stand below it."""
     if docname.startswith("auto_tutorials/"):
         above = r"\.\. only:: html\n\n    \.\. note::\n        :class: sphx-glr-download-link-note.*?(?=^\S)"
         below = r"    \.\. container:: sphx-glr-download sphx-glr-download-zip.*"
@@ -180,7 +180,7 @@ def _keep_what_formulas_need(app, error):
 
 def setup(app):
     """Connect the handlers above."""
-    app.connect("source-read", _one_download)
+    app.connect("source-read", _few_downloads)
     app.connect("source-read", _link_as_repository)
     app.connect("source-read", _link_names)
     app.connect("autodoc-process-signature", _show_own_signature)
