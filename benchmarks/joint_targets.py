@@ -109,10 +109,16 @@ def task(options: DataOptions) -> Task:
     if style not in ("ph", "mh"):
         raise ValueError(f"--data {style} has no scripted demonstrations: name ph or mh")
     path = demonstrations(style, options.count(style))
-    return Task.open(path, style=style, observation_keys=OBSERVATION, joint_key=f"{ARM}joint_pos")
+    return Task.open(
+        path,
+        style=style,
+        observation_keys=OBSERVATION,
+        joint_key=f"{ARM}joint_pos",
+        horizon=options.time_limit,
+    )
 
 
-PLAYED = {"data": {"task": ("joint_targets:task",)}}
+PLAYED = {"data": {"task": ("joint_targets:task",), "actions": "delta"}}
 
 
 @script("joint_targets.py", together=True)

@@ -16,17 +16,22 @@ import sys
 
 from robomimic import run
 
-from lab.options import PRESETS, Options, adapted, script, with_parts
+from lab.options import IMAGES, PRESETS, Options, adapted, script, with_parts
 
-# The paper's number of demonstrations, and a training for so few.
-FEW = {
-    name: with_parts(
-        preset,
-        data={"task": ("stack",), "demonstrations": (10,), "obs": "image" if name == "paper" else "state"},
-        training={"iterations": 50_000 if name == "paper" else 5_000, "batch_size": 128},
+LARGE = ("paper", "much-ado")  # presets for a GPU, which see images
+
+
+def few(name: str, preset: Options) -> Options:
+    """A preset for the paper's number of demonstrations, with a training for so few."""
+    large = name in LARGE
+    return with_parts(
+        with_parts(preset, **IMAGES[name]) if large else preset,
+        data={"task": ("stack",), "demonstrations": (10,), "obs": "image" if large else "state"},
+        training={"iterations": 50_000 if large else 5_000, "batch_size": 128},
     )
-    for name, preset in PRESETS.items()
-}
+
+
+FEW = {name: few(name, preset) for name, preset in PRESETS.items()}
 
 
 def adapt(preset: Options, asked: Options) -> Options:

@@ -143,7 +143,8 @@ def learn(
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
-    parts = {"horizon": options.horizon, **options.evaluation.environment}
+    limit = {} if options.horizon is None else {"horizon": options.horizon}
+    parts = limit | options.evaluation.environment
     rounds = None
     if options.collectors is not None:
         from lab.ray_collection import ray_rounds

@@ -63,13 +63,13 @@ def relative(options: DataOptions) -> Task:
 # All human demonstrations, unless --demonstrations says how many. On 25,650 steps of theirs the usual 10,000
 # iterations stop early: at one step the Gaussian source scores 0.59 after them, 0.79 after 22,500 and 0.88
 # after 45,000.
-HUMAN = {"data": {"task": ("pusht:task",), "demonstrations": ()}}
-LONGER = {"quick": {"iterations": 22_500}, "cpu": {"iterations": 45_000}, "paper": {}}
+HUMAN = {"data": {"task": ("pusht:task",), "demonstrations": (), "actions": "delta"}}
+LONGER = {"quick": {"iterations": 22_500}, "cpu": {"iterations": 45_000}}
 
 
 @script("pusht.py", together=True)
 def main(argv: list[str] | None) -> None:
-    presets = {name: with_parts(p, **HUMAN, training=LONGER[name]) for name, p in PRESETS.items()}
+    presets = {name: with_parts(p, **HUMAN, training=LONGER.get(name, {})) for name, p in PRESETS.items()}
     run(argv, presets, "pusht", __doc__)
 
 

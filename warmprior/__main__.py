@@ -153,7 +153,7 @@ class Train:
             tenth where no environment is known, none elsewhere).
         task: of robosuite, for a LeRobotDataset that does not describe its environment.
         style: of the demonstrations, which decides robosuite's time limit (default: ph, and human elsewhere).
-        horizon: control steps per episode of a Minari dataset's environment (default: its own).
+        horizon: control steps per episode (default: the environment's own, or robosuite's for the style).
         out: folder of the trainings (default: policies); an interrupted one continues.
         device: of the network, such as cuda.
     """

@@ -106,8 +106,9 @@ class Evaluation:
 class Run:
     """Where and how to compute."""
 
-    # The budget that the other options start from: quick, cpu or paper; navigation1d.py has quick and paper,
-    # prior_space_rl.py quick, unit and paper.
+    # What the other options start from: quick, cpu, paper, or much-ado (the paper's with the details of the
+    # public code that it may stand on); navigation1d.py has quick and paper, prior_space_rl.py quick, unit
+    # and paper.
     preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered one under runs/)
     resume: bool = False  # continue in --out, or in the latest default folder, with the options stored there
@@ -178,7 +179,10 @@ class Options:
         except ValueError as error:
             raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):
-            raise ValueError("--actions belongs to robosuite's tasks: a task of your own has its own")
+            raise ValueError(
+                "--actions absolute belongs to robosuite's tasks, and a task of your own has its own: add "
+                "--actions delta"
+            )
         if self.evaluation.play_on and not all(map(is_simulated, self.data.task)):
             raise ValueError("--play-on belongs to robosuite's tasks: leave it out")
         if self.training.weighting == "standardised" and not self.network.precondition:
@@ -232,6 +236,15 @@ def check_single(options: Options, *names: str) -> None:
             raise ValueError(f"this study has one --{name}, got {' '.join(map(str, values))}")
 
 
+def with_parts[O](options: O, **parts: Any) -> O:
+    """Options with some leaves replaced: by part, or where they are no part's."""
+    made: Any = {
+        part: replace(getattr(options, part), **values) if isinstance(values, Mapping) else values
+        for part, values in parts.items()
+    }
+    return replace(options, **made)  # type: ignore[type-var]
+
+
 PRESETS: dict[str, Options] = {
     # One seed, a small network and half of the training that the tables have: a first table.
     "quick": Options(data=DataOptions(demonstrations=(100,)), training=TrainingConfig(iterations=5_000)),
@@ -245,6 +258,15 @@ PRESETS: dict[str, Options] = {
         evaluation=Evaluation(seeds=3, episodes=200, top_k=3),
     ),
 }
+# The same with the answers of the public code that the paper may stand on, Much Ado About Noising, where it
+# has others (docs/paper.md). It clips a tenth of the loss's gradient to a norm of 10.
+PRESETS["much-ado"] = with_parts(
+    PRESETS["paper"],
+    data={"actions": "absolute"},
+    network={"observation_layers": 2, "time_frequency": 1e-4},
+    training={"warmup_ratio": 0.0, "max_grad_norm": 100.0, "count_padding": True},
+    evaluation={"temperature": (0.0,)},
+)
 
 # What a preset does differently where policies see images. Small images and networks, and a task that is
 # solved from them: 15 minutes on two cores.
@@ -257,6 +279,11 @@ IMAGES: dict[str, dict[str, dict[str, Any]]] = {
     "quick": {**SMALL_IMAGES, "evaluation": {"nfe": (3, 1)}},
     "cpu": SMALL_IMAGES,
     "paper": {"training": {"batch_size": 256}},
+    "much-ado": {
+        "data": {"actions": "delta"},  # images go with no others
+        "network": {"encoder": "resnet18"},
+        "training": {"batch_size": 256},
+    },
 }
 
 
@@ -280,15 +307,6 @@ def adapted[O: Options](preset: O, asked: Options) -> O:
             print(f"{error}. The encoder starts from random weights.", flush=True)
             return with_parts(preset, network={"encoder": "resnet18"})
     return preset
-
-
-def with_parts[O](options: O, **parts: Any) -> O:
-    """Options with some leaves replaced: by part, or where they are no part's."""
-    made: Any = {
-        part: replace(getattr(options, part), **values) if isinstance(values, Mapping) else values
-        for part, values in parts.items()
-    }
-    return replace(options, **made)  # type: ignore[type-var]
 
 
 def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:

@@ -93,7 +93,8 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """The policy of averaged weights, on the CPU, as it is played here."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
-        policy = load_policy(path)
+        # Runs of another time limit share it.
+        policy = load_policy(path).replace(environment=self.task().environment)
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
 
     @property

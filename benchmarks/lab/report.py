@@ -341,9 +341,12 @@ def unlike(options: Options, paper: Options) -> list[str]:
         )
         return {name: value for name, value in values.items() if name not in NO_RECIPE}
 
+    def text(value: Any) -> str:
+        return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
     theirs = recipe(paper)
     found = [
-        f"{name.replace('_', ' ')} {value} ({theirs[name]})"
+        f"{name.replace('_', ' ')} {text(value)} ({text(theirs[name])})"
         for name, value in recipe(options).items()
         if value != theirs[name]
     ]

@@ -109,7 +109,7 @@ class DataOptions:
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         mask: name of a mask in the file, such as train; only its demonstrations are used.
-        time_limit: control steps per episode of a Minari dataset's environment (default: its own).
+        time_limit: control steps per episode (default: the environment's own, or robosuite's for ph or mh).
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
         actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.

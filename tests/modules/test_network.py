@@ -82,13 +82,15 @@ def test_a_size_that_cannot_work_is_named(kind, size, value):
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])
-def test_timestep_embedding_closed_form(dim):
+@pytest.mark.parametrize("last", [{}, {"last": 100.0}, {"last": 1e-4}, {"last": 7.0}])
+def test_timestep_embedding_closed_form(dim, last):
+    top = last.get("last", 100.0)
     times = [0.0, 0.1, 0.5, 1.0]
     half = dim // 2
     rows = []
     for t in times:
-        angles = [t * 100 ** (i / (half - 1)) for i in range(half)]  # frequencies from 1 to 100
+        angles = [t * top ** (i / (half - 1)) for i in range(half)]
         rows.append([math.sin(x) for x in angles] + [math.cos(x) for x in angles])
     torch.testing.assert_close(
-        TimestepEmbedding(dim)(torch.tensor(times)), torch.tensor(rows), atol=2e-5, rtol=0
+        TimestepEmbedding(dim, **last)(torch.tensor(times)), torch.tensor(rows), atol=2e-5, rtol=0
     )

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import nn
 
 from warmprior import AdaLNTransformer, ChiTransformer
+from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.registry import from_config
 
 
 def tiny(length=4, steps=2, **options):
@@ -109,3 +113,77 @@ def test_every_action_sees_every_other_the_observations_and_the_time():
 def test_heads_divide_the_width(kind):
     with pytest.raises(ValueError, match="num_heads must divide embedding_dim, got 5 and 24"):
         kind(2, 3, 4, embedding_dim=24, num_heads=5)
+
+
+def by_hand(part, x):
+    """Matrices with GELU between them."""
+    (first, *rest) = [layer for layer in part.modules() if isinstance(layer, nn.Linear)]
+    x = x @ first.weight.T + first.bias
+    for layer in rest:
+        x = (x * (1 + torch.erf(x / math.sqrt(2))) / 2) @ layer.weight.T + layer.bias
+    return x
+
+
+@pytest.mark.parametrize("layers", [None, 0, 1, 2])
+def test_observation_tokens_by_hand(layers):
+    """Without hidden layers a token is of its own step; with some it is of all of them."""
+    network = tiny(4, 3, **({} if layers is None else {"observation_layers": layers}))
+    matrices = [p for p in network.embed_observation.parameters() if p.ndim == 2]
+    o, t, seen = torch.randn(5, 3, 3), torch.rand(5), []
+    if layers:
+        assert [tuple(p.shape) for p in matrices] == [(24, 9), *[(24, 24)] * (layers - 1), (72, 24)]
+        tokens = by_hand(network.embed_observation, o.reshape(5, 9)).reshape(5, 3, 24)
+    else:
+        assert [tuple(p.shape) for p in matrices] == [(24, 3)]
+        tokens = by_hand(network.embed_observation, o)
+    memory = torch.cat([network.embed_time(t)[:, None], tokens], 1) + network.memory_position
+    network.encoder.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    network(t, torch.randn(5, 4, 2), o)
+    torch.testing.assert_close(seen[0], memory)
+
+
+@pytest.mark.parametrize("layers", [None, 0, 1, 2])
+def test_the_modulation_reads_the_observations_through_so_many_layers(layers):
+    network = modulated(**({} if layers is None else {"observation_layers": layers}))
+    matrices = [p for p in network.embed_observation.parameters() if p.ndim == 2]
+    assert len(matrices) == 1 + (1 if layers is None else layers)
+    o, t, seen = torch.randn(5, 2, 3), torch.rand(5), []
+    condition = network.embed_time(t) + by_hand(network.embed_observation, o.reshape(5, 6))
+    network.blocks[0].modulate.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    network(t, torch.randn(5, 4, 2), o)
+    torch.testing.assert_close(seen[0], condition * torch.sigmoid(condition))
+
+
+@pytest.mark.parametrize("make", [tiny, modulated])
+def test_the_new_options_are_saved_and_change_nothing_else(make):
+    usual = make()
+    for name, value in (("observation_layers", 2), ("time_frequency", 1e-4)):
+        changed = make(**{name: value})
+        assert {k: v for k, v in changed.config().items() if v != usual.config()[k]} == {name: value}
+        again = from_config(VelocityNetwork, changed.config())
+        again.load_state_dict(changed.state_dict())
+        t, a, o = torch.rand(5), torch.randn(5, 4, 2), torch.randn(5, 2, 3)
+        torch.testing.assert_close(again.eval()(t, a, o), changed(t, a, o), rtol=0, atol=0)
+        # Of other frequencies no weight changes; of other layers those of the observations.
+        one, two = usual.state_dict(), changed.state_dict()
+        same = {k for k in one if k in two and torch.equal(one[k], two[k])}
+        assert (same == one.keys() == two.keys()) == (name == "time_frequency")
+        assert {k.split(".")[0] for k in one.keys() ^ two.keys()} <= {"embed_observation"}
+    embedding = make(time_frequency=1e-4).embed_time[0]
+    assert embedding.frequencies[[0, -1]].tolist() == pytest.approx([1, 1e-4])
+    assert usual.embed_time[0].frequencies[-1] == 100
+
+
+@pytest.mark.parametrize("kind", [AdaLNTransformer, ChiTransformer])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"observation_layers": -1}, "observation_layers must be a whole number of at least 0, got -1"),
+        ({"observation_layers": 1.5}, "observation_layers must be a whole number of at least 0, got 1.5"),
+        ({"time_frequency": 0.0}, "time_frequency must be a finite number > 0, got 0.0"),
+        ({"time_frequency": math.inf}, "time_frequency must be a finite number > 0, got inf"),
+    ],
+)
+def test_options_out_of_range(kind, options, said):
+    with pytest.raises(ValueError, match=said):
+        kind(2, 3, 4, **options)

@@ -38,9 +38,11 @@ def standardised():
     return PreconditionedNetwork(mlp(), moments=SourceMoments(0 * one, 0 * one, one, one, 0 * one))
 
 
+CLIPPED = 0.1
 CASES = {
     "plain": ({}, {}, lambda: actor_for(PastPrior(4), mlp())),
     "dropout, withheld": ({"cold_probability": 0.5}, {}, actor_for),
+    "clipped": ({"max_grad_norm": CLIPPED}, {}, lambda: actor_for(LearningPrior(4), mlp())),
     "learning prior": ({}, {}, lambda: actor_for(LearningPrior(4), mlp())),
 }
 """Recipes, options and policies."""

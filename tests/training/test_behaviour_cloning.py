@@ -12,7 +12,16 @@ import time
 import pytest
 import torch
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
+from tests.training.cloning_parts import (
+    CONFIG,
+    actor_for,
+    dataset,
+    mlp,
+    run_until,
+    same,
+    training,
+    weights,
+)
 from warmprior import FlowMatchingLoss, SelfDistillationLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
@@ -22,13 +31,15 @@ from warmprior.training.options import PAPER
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
 """Options beside Algorithm 1's; the average is the teacher."""
 
+PUBLIC = {"max_grad_norm": 1.2, "count_padding": True, "warmup_ratio": 0.0}
+"""Of the public code that the paper may stand on."""
 
-@pytest.mark.parametrize("options", [{}, LATER], ids=["algorithm 1", "later"])
+
+@pytest.mark.parametrize("options", [{}, LATER, PUBLIC], ids=["algorithm 1", "later", "public code"])
 def test_the_loop_by_hand(tmp_path, options):
     """Sample, loss, AdamW at the scheduled rate, EMA: written out with PyTorch's own parts."""
-    config = dataclasses.replace(
-        CONFIG, iterations=12, checkpoints=1, warmup_ratio=0.25, ema_rate=0.9, **options
-    )
+    changes = {"iterations": 12, "checkpoints": 1, "warmup_ratio": 0.25, "ema_rate": 0.9}
+    config = dataclasses.replace(CONFIG, **changes | options)
     network = VelocityMLP(2, 3, 4, hidden_dim=8)
     other, average = copy.deepcopy(network), copy.deepcopy(network)
     cloning = training(tmp_path, config, actor=actor_for(network=network))
@@ -38,24 +49,37 @@ def test_the_loop_by_hand(tmp_path, options):
     generator = torch.Generator().manual_seed(config.seed)
     buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator)
     recipe = dict(options)
+    clipped, padding = recipe.pop("max_grad_norm", None), recipe.pop("count_padding", False)
+    warmup = round(12 * recipe.pop("warmup_ratio", 0.25))
     weight = recipe.pop("self_distillation", 0.0)
     loss = FlowMatchingLoss(actor, generator=generator, **recipe)
     recipe.pop("times", None)
     distillation = SelfDistillationLoss(actor, generator=generator, teacher=average, **recipe)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
-    losses = []
+    losses, lengths, padded = [], [], 0
     for step in range(12):
-        progress = (step - 3) / 9
-        factor = (step + 1) / 3 if step < 3 else 0.5 * (1 + torch.tensor(progress * torch.pi).cos())
+        progress = (step - warmup) / (12 - warmup)
+        factor = (step + 1) / 3 if step < warmup else 0.5 * (1 + torch.tensor(progress * torch.pi).cos())
         for group in optimizer.param_groups:
             group["lr"] = float(config.learning_rate * factor)
         batch = buffer.sample()
+        padded += batch["action_is_pad"].sum().item()
+        if padding:
+            batch["action_is_pad"] = torch.zeros_like(batch["action_is_pad"])
         value = loss(batch)["loss_flow_matching"]
         if weight:
             value = value + weight * distillation(batch)["loss_self_distillation"]
         losses.append(value.item())
         optimizer.zero_grad()
-        value.backward()
+        if clipped is None:
+            value.backward()
+        else:  # as in that code: a tenth of the loss, whose gradient is clipped to a tenth of the norm
+            (0.1 * value).backward()
+            lengths.append(sum(p.grad.square().sum() for p in other.parameters()).sqrt().item())
+            for p in other.parameters():
+                p.grad *= min(1.0, 0.1 * clipped / lengths[-1])
+            for group in optimizer.param_groups:
+                group["eps"] = 1e-9  # AdamW sees the tenth here alone
         optimizer.step()
         with torch.no_grad():
             for mean, now in zip(average.parameters(), other.parameters(), strict=True):
@@ -65,6 +89,9 @@ def test_the_loop_by_hand(tmp_path, options):
     kept = load_policy(cloning.policy_path(12)).network
     for name, value in average.state_dict().items():
         torch.testing.assert_close(kept.state_dict()[name], value)
+    assert padded > 0
+    if clipped is not None:
+        assert min(lengths) < 0.1 * clipped < max(lengths)
     assert [i for i, _ in cloning.losses] == [10, 12]
     assert cloning.losses[0][1] == pytest.approx(sum(losses[:10]) / 10, rel=1e-4)
     assert cloning.losses[1][1] == pytest.approx(sum(losses[10:]) / 2, rel=1e-4)
@@ -72,7 +99,7 @@ def test_the_loop_by_hand(tmp_path, options):
 
 @pytest.mark.parametrize(
     ("stop", "recipe", "options"),
-    [(6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True}), (16, LATER, {})],
+    [(6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True}), (16, LATER, {}), (16, PUBLIC, {})],
 )
 def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):
     """Without a kill: an exception in the middle of the loop, then a new object."""
@@ -94,6 +121,19 @@ def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):
         one, two = whole.policy_path(i), again.policy_path(i)
         for name in ("config.json", "model.safetensors"):
             assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+@pytest.mark.parametrize(("precision", "compiled"), [("float32", False), ("bf16", False), ("bf16", True)])
+def test_a_gradient_is_shortened_to_the_norm_and_keeps_its_direction(tmp_path, precision, compiled):
+    gradients = {}
+    for norm in (None, 1e-2, 1e9):
+        config = dataclasses.replace(CONFIG, max_grad_norm=norm, precision=precision)
+        cloning = training(tmp_path / str(norm), config, actor=actor_for(network=mlp()), compile=compiled)
+        cloning.step()
+        gradients[norm] = torch.cat([p.grad.flatten() for p in cloning.actor.network.parameters()])
+    whole = gradients[None]
+    torch.testing.assert_close(gradients[1e-2], 1e-2 * whole / whole.norm(), rtol=1e-4, atol=1e-8)
+    assert torch.equal(gradients[1e9], whole)  # bit by bit
 
 
 def test_a_finished_training_stays_as_it_is(tmp_path):

@@ -9,7 +9,7 @@ import torch
 
 from tests.together import together
 from tests.training.cloning_parts import CONFIG
-from tests.training.data_parallel_parts import CASES, STEPS, cloning, dies, whole
+from tests.training.data_parallel_parts import CASES, CLIPPED, STEPS, cloning, dies, whole
 from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state
 
@@ -41,6 +41,17 @@ def test_each_draws_windows_of_its_own_and_all_take_one_step(folder, case):
     assert any(gradient.abs().max() > 1e-3 for gradient in gradients.values())
     assert points[0].shape == others[0].shape and len(points[0]) == CONFIG.batch_size // 2
     assert not torch.isclose(points[0], others[0]).all(-1).all(-1).any()
+
+
+def test_the_mean_of_all_gradients_is_clipped(folder):
+    """Means of clipped ones would be shorter, because their directions differ."""
+    for first in both(folder, "first"):
+        _, gradients, _ = first["clipped"]
+        _, whole, _ = first["learning prior"]
+        length = torch.cat([g.flatten() for g in whole.values()]).norm()
+        assert length > 2 * CLIPPED
+        for name, gradient in whole.items():
+            torch.testing.assert_close(gradients[name], CLIPPED * gradient / length, rtol=1e-4, atol=1e-7)
 
 
 def test_the_windows_of_the_others_count(folder, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lab.tasks import navigation_task
-from warmprior import PastPrior
+from warmprior import ChiTransformer, PastPrior
 from warmprior.modules import PreconditionedNetwork
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.train import new_policy
@@ -52,6 +52,28 @@ def test_what_does_not_exist_is_refused_with_what_does():
         navigation_task("ph")
     with pytest.raises(ValueError, match=r"network must be one of mlp, plain_mlp, .*, got 'nonsense'"):
         NetworkOptions(network="nonsense")
+
+
+@pytest.mark.parametrize(("name", "value"), [("observation_layers", 2), ("time_frequency", 1e-4)])
+def test_options_of_transformers_reach_them_alone(name, value):
+    for network in ("chi_transformer", "adaln_transformer"):
+        usual, made = (
+            NetworkOptions(network, hidden_dim=12, **more).make(2, 3, 4) for more in ({}, {name: value})
+        )
+        assert made.config() == usual.config() | {name: value} != usual.config()
+    assert NetworkOptions("chi_transformer").make(2, 3, 4).config() == ChiTransformer(2, 3, 4).config()
+    for network in ("mlp", "plain_mlp"):
+        said = f"{name} belongs to chi_transformer and adaln_transformer: leave it None with .* {network}$"
+        with pytest.raises(ValueError, match=said):
+            NetworkOptions(network, **{name: value})
+    with pytest.raises(ValueError, match=f"{name} must be a .*, got -1"):
+        NetworkOptions("chi_transformer", **{name: -1})
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_norm_that_no_gradient_can_have_is_refused(value):
+    with pytest.raises(ValueError, match="max_grad_norm must be a finite number > 0"):
+        TrainingConfig(max_grad_norm=value)
 
 
 def test_a_fresh_policy_has_the_parts_that_were_asked_for():

@@ -29,6 +29,7 @@ def environment_description(
     images: Mapping[str, Any] | None = None,
     *,
     low_dim_keys: Sequence[str] | None = None,
+    horizon: int | None = None,
 ) -> dict[str, Any]:
     """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
 
@@ -44,6 +45,7 @@ def environment_description(
 
     Keyword Args:
         low_dim_keys: what a policy without images sees, where that is not the task's own.
+        horizon: see :class:`RobosuiteEnv`.
 
     Examples:
         >>> from warmprior.envs import environment_description
@@ -57,6 +59,8 @@ def environment_description(
     }
     if low_dim_keys is not None:
         description["robosuite"]["low_dim_keys"] = list(low_dim_keys)
+    if horizon is not None:
+        description["robosuite"]["horizon"] = horizon
     if actions != "delta":
         description["actions"] = actions
     if images is not None:
@@ -173,7 +177,7 @@ def _is_complete(description: Any) -> bool:
         images = description.get("images", dict.fromkeys(_IMAGES))
         return (
             description.keys() - {"actions", "images"} == {"robosuite", "observation_steps"}
-            and description["robosuite"].keys() - {"low_dim_keys"} == {"env_args", "style"}
+            and description["robosuite"].keys() - {"low_dim_keys", "horizon"} == {"env_args", "style"}
             and description.get("actions", "delta") in ("delta", "absolute")
             and images.keys() == set(_IMAGES)
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_positive, check_whole_numbers
 from warmprior.modules.registry import Registered
 
 
@@ -151,20 +152,22 @@ def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size)
 
 
 class TimestepEmbedding(nn.Module):
-    """Sines and cosines of times ``[B]`` in [0, 1], ``[B, dim]``, at frequencies from 1 to 100, log-spaced.
+    """Sines and cosines of times ``[B]`` in [0, 1], ``[B, dim]``, at frequencies from 1 to ``last``.
 
-    The embedding of diffusion models, made for a thousand steps, does not suit flows: at ``1000 t`` its
-    fastest features are noise to the network, and ``t = 0``, the only time that a one-step sampler evaluates,
-    looks unlike every time seen in training. A ``ValueError`` if ``dim`` is odd or < 4.
+    They are log-spaced. The embedding of diffusion models, made for a thousand steps, does not suit flows: at
+    ``1000 t`` its fastest features are noise to the network, and ``t = 0``, the only time that a one-step
+    sampler evaluates, looks unlike every time seen in training. A ``ValueError`` if ``dim`` is odd or < 4, or
+    if ``last`` is not > 0.
     """
 
     frequencies: Tensor
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, last: float = 100.0) -> None:
         super().__init__()
+        check_positive(time_frequency=last)
         if dim < 4 or dim % 2:
             raise ValueError(f"the timestep embedding must be even and >= 4, got {dim}")
-        self.register_buffer("frequencies", torch.logspace(0, 2, dim // 2), persistent=False)
+        self.register_buffer("frequencies", torch.logspace(0, math.log10(last), dim // 2), persistent=False)
 
     def forward(self, t: Tensor) -> Tensor:
         """Embed the times."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from warmprior.checks import check_whole_numbers
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 
 
-def _check_sizes(num_heads: int, embedding_dim: int, num_layers: int) -> None:
+def _check_sizes(num_heads: int, embedding_dim: int, num_layers: int, observation_layers: int) -> None:
     check_whole_numbers(num_heads=num_heads, embedding_dim=embedding_dim, num_layers=num_layers)
+    check_whole_numbers(0, observation_layers=observation_layers)
     if embedding_dim % num_heads:
         raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
 
@@ -39,6 +41,9 @@ class ChiTransformer(VelocityNetwork):
         num_heads: attention heads, a divisor of ``embedding_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
         dropout: in attention and feed-forward layers.
+        observation_layers: hidden layers of a network that makes the observation tokens from all ``To`` steps
+            together; without any, each token is a linear function of its own step.
+        time_frequency: the time embedding has frequencies from 1 to this one.
 
     Raises:
         ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
@@ -65,16 +70,27 @@ class ChiTransformer(VelocityNetwork):
         num_heads: int = 6,
         timestep_embedding_dim: int = 128,
         dropout: float = 0.1,
+        observation_layers: int = 0,
+        time_frequency: float = 100.0,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_sizes(num_heads, embedding_dim, num_layers)
+        _check_sizes(num_heads, embedding_dim, num_layers, observation_layers)
         self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
         self.timestep_embedding_dim, self.dropout = timestep_embedding_dim, dropout
+        self.observation_layers, self.time_frequency = observation_layers, time_frequency
         self.embed_time = nn.Sequential(
-            TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
+            TimestepEmbedding(timestep_embedding_dim, time_frequency),
+            nn.Linear(timestep_embedding_dim, embedding_dim),
         )
         self.embed_action = nn.Linear(action_dim, embedding_dim)
-        self.embed_observation = nn.Linear(observation_dim, embedding_dim)
+        self.embed_observation: nn.Module = nn.Linear(observation_dim, embedding_dim)
+        if observation_layers:
+            sizes = observation_steps * observation_dim, observation_steps * embedding_dim
+            self.embed_observation = nn.Sequential(
+                nn.Flatten(),
+                MLP(*sizes, depth=observation_layers, num_cells=embedding_dim, activation_class=nn.GELU),
+                nn.Unflatten(-1, (observation_steps, embedding_dim)),
+            )
         self.action_position = nn.Parameter(torch.empty(1, prediction_length, embedding_dim))
         self.memory_position = nn.Parameter(torch.empty(1, 1 + observation_steps, embedding_dim))
         self.encoder = nn.Sequential(
@@ -161,6 +177,8 @@ class AdaLNTransformer(VelocityNetwork):
         num_layers: blocks.
         num_heads: attention heads, a divisor of ``embedding_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
+        observation_layers: hidden layers of the network that reads all ``To`` steps together.
+        time_frequency: the time embedding has frequencies from 1 to this one.
 
     Raises:
         ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
@@ -184,18 +202,21 @@ class AdaLNTransformer(VelocityNetwork):
         num_layers: int = 8,
         num_heads: int = 6,
         timestep_embedding_dim: int = 128,
+        observation_layers: int = 1,
+        time_frequency: float = 100.0,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_sizes(num_heads, embedding_dim, num_layers)
+        _check_sizes(num_heads, embedding_dim, num_layers, observation_layers)
         self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
         self.timestep_embedding_dim = timestep_embedding_dim
+        self.observation_layers, self.time_frequency = observation_layers, time_frequency
         self.embed_time = nn.Sequential(
-            TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
+            TimestepEmbedding(timestep_embedding_dim, time_frequency),
+            nn.Linear(timestep_embedding_dim, embedding_dim),
         )
-        self.embed_observation = nn.Sequential(
-            nn.Linear(observation_steps * observation_dim, embedding_dim),
-            nn.GELU(),
-            nn.Linear(embedding_dim, embedding_dim),
+        sizes = observation_steps * observation_dim, embedding_dim
+        self.embed_observation = MLP(
+            *sizes, depth=observation_layers, num_cells=embedding_dim, activation_class=nn.GELU
         )
         self.embed_action = nn.Linear(action_dim, embedding_dim)
         self.action_position = nn.Parameter(0.02 * torch.randn(1, prediction_length, embedding_dim))

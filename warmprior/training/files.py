@@ -41,13 +41,14 @@ def recorded_task(
     style: str,
     observation_steps: int,
     actions: Literal["delta", "absolute"],
+    horizon: int | None,
 ) -> dict[str, Any]:
     """Data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
     seen = None
     if images is None and (dataset.task is None or dataset.observation_keys != dataset.task.low_dim_keys):
         seen = dataset.observation_keys
     description = environment_description(
-        dataset.env_args, style, observation_steps, actions, images, low_dim_keys=seen
+        dataset.env_args, style, observation_steps, actions, images, low_dim_keys=seen, horizon=horizon
     )
     make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from warmprior import keys
 from warmprior.io.distributed import world_size
 from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
@@ -80,6 +81,7 @@ class GradientStep:
             self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self._graphs = False
+        self._max_grad_norm, self._count_padding = config.max_grad_norm, config.count_padding
 
     def compile(self) -> None:
         """Compile the network; on a GPU, as CUDA graphs."""
@@ -89,12 +91,16 @@ class GradientStep:
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
         """Take a step on a batch of windows; return its loss, a detached scalar."""
+        if self._count_padding:
+            batch = batch.exclude(keys.IS_PAD)
         if self._graphs:  # what the graphs of the last step have left may be overwritten
             torch.compiler.cudagraph_mark_step_begin()
         with self._precision():
             loss = self._loss(batch)
         self.optimizer.zero_grad()
         loss.backward()
+        if self._max_grad_norm is not None:  # of all processes by now
+            nn.utils.clip_grad_norm_(self.trained.parameters(), self._max_grad_norm)
         self.optimizer.step()
         self.schedule.step()
         self.ema.update_parameters(self.trained)

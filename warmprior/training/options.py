@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from warmprior.checks import check_choice, check_finite_numbers, check_whole_numbers
+from warmprior.checks import check_choice, check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
@@ -40,6 +41,10 @@ class NetworkOptions:
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
+        observation_layers: of a transformer, hidden layers of the network that reads all To observations
+            together; by default 1 in adaln_transformer, and 0 in chi_transformer, which embeds each alone.
+        time_frequency: of a transformer, the last frequency of its time embedding, which starts from 1; 100
+            by default.
         encoder: of images, a network per camera: ResNet-18 from ImageNet's weights, which torchvision
             downloads once, from random ones, or a small network.
         crop_size: side of the random window of an image that is seen in training, the central one else.
@@ -58,6 +63,8 @@ class NetworkOptions:
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
+    observation_layers: int | None = None
+    time_frequency: float | None = None
     encoder: Literal["resnet18-imagenet", "resnet18", "small"] = "resnet18-imagenet"
     crop_size: int = 76
     share_encoder: bool = False
@@ -66,6 +73,20 @@ class NetworkOptions:
         counts = ("hidden_dim", "observation_steps", "crop_size")
         check_whole_numbers(**{n: value for n in counts if (value := getattr(self, n)) is not None})
         check_choice("network", self.network, _NETWORKS)
+        if self.observation_layers is not None:
+            check_whole_numbers(0, observation_layers=self.observation_layers)
+        if self.time_frequency is not None:
+            check_positive(time_frequency=self.time_frequency)
+        for name in self._of_transformers():
+            able = [key for key, (kind, _) in _NETWORKS.items() if name in inspect.signature(kind).parameters]
+            if self.network not in able:
+                raise ValueError(
+                    f"{name} belongs to {' and '.join(able)}: leave it None with the network {self.network}"
+                )
+
+    def _of_transformers(self) -> dict[str, Any]:
+        asked = {"observation_layers": self.observation_layers, "time_frequency": self.time_frequency}
+        return {name: value for name, value in asked.items() if value is not None}
 
     def without_images(self) -> NetworkOptions:
         """With the defaults for what has no effect where no images are seen."""
@@ -85,7 +106,9 @@ class NetworkOptions:
         Beside images ``d_o`` is the width of the vector.
         """
         kind, width = _NETWORKS[self.network]
-        options = {} if self.hidden_dim is None else {width: self.hidden_dim}
+        options = self._of_transformers()
+        if self.hidden_dim is not None:
+            options[width] = self.hidden_dim
         encoder = None
         if images:
             encoder = ImageEncoder(
@@ -126,6 +149,7 @@ class TrainingConfig:
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
         warmup_ratio: share of the iterations over which the learning rate rises.
+        max_grad_norm: to which longer gradients are shortened, of all weights together; none by default.
         ema_rate: decay of the averaged weights that are evaluated.
         checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
         save_every: iterations between saves of the training state, ten per checkpoint by default.
@@ -137,6 +161,7 @@ class TrainingConfig:
             that every time counts alike (standardised). By default the latter where the network is
             preconditioned.
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
+        count_padding: actions past the end of an episode, where its last one is repeated, count in the loss.
         precision: of the network's matrix products in training; weights, averages and optimiser are float32.
         cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
 
@@ -152,6 +177,7 @@ class TrainingConfig:
     learning_rate: float = 1e-3
     weight_decay: float = 1e-5
     warmup_ratio: float = 0.1
+    max_grad_norm: float | None = None
     ema_rate: float = 0.995
     checkpoints: int = 1
     save_every: int | None = None
@@ -161,6 +187,7 @@ class TrainingConfig:
     objective: Objective = "velocity"
     weighting: Weighting | None = None
     self_distillation: float = 0.0
+    count_padding: bool = False
     precision: Precision = "float32"
     cold_probability: float = 0.0
 
@@ -169,6 +196,8 @@ class TrainingConfig:
         check_whole_numbers(**{name: getattr(self, name) for name in counts})
         if self.save_every is not None:
             check_whole_numbers(save_every=self.save_every)
+        if self.max_grad_norm is not None:
+            check_positive(max_grad_norm=self.max_grad_norm)
         if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # others are counted from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
         for name, words, fits in (

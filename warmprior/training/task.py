@@ -196,7 +196,7 @@ class Task:
             fast_rendering: whether the images are without reflections, shadows and smooth edges.
             mask: a mask of the file, such as ``"train"``.
             demos: how many to take, from the first on; all by default.
-            horizon: control steps per episode in an environment of Gymnasium; its own by default.
+            horizon: control steps per episode; by default the environment's own, or that of the style.
             **outcome: ``success``, ``measures`` and ``film_rate`` beside a ``make_env``, see :meth:`of`.
 
         Raises:
@@ -239,8 +239,6 @@ class Task:
             recorded: Any = partial(registered_env, environment)
             return replace(opened, facts=said, make_env=recorded, environment=description)
         style, cameras = style or "ph", [key.removesuffix("_image") for key in image_keys]
-        if horizon is not None:
-            raise ValueError("horizon is for environments of Gymnasium: robosuite's follows from the style")
         if demos == len(index.demos):
             demos = None  # all of them
         name = files.task_name(index)
@@ -257,7 +255,12 @@ class Task:
             demos=demos,
         )
         recorded = files.recorded_task(
-            dataset, images, style=style, observation_steps=observation_steps, actions=actions
+            dataset,
+            images,
+            style=style,
+            observation_steps=observation_steps,
+            actions=actions,
+            horizon=horizon,
         )
         sha256 = found.digest(observation_keys=observation_keys, image_keys=image_keys, demos=demos)
         # Nothing is said of what is usual.
