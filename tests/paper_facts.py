@@ -84,3 +84,15 @@ BOX_AROUND_MEAN, BOX_AROUND_ZERO = 0.5, 1.5
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 SIGMA_STUDY = {"nfe": (1,), "seeds": 3, "chunk": (8,)}
 SIGMA_SUCCESS = {("past", 0.5): 0.701, ("past", 0.0): 0.05, ("preview", 1.0): 0.778, ("preview", 0.0): 0.31}
+
+# What the public code that the paper may stand on does otherwise: "Much Ado About Noising" at commit 9f28318.
+LOSS_FACTOR, CLIP_NORM = 0.1, 10.0
+MUCH_ADO = {
+    "warmup_ratio": 0.0,
+    "max_grad_norm": CLIP_NORM / LOSS_FACTOR,
+    "count_padding": True,
+    "observation_layers": 2,
+    "time_frequency": 1e-4,
+    "temperature": [0.0],
+}
+MUCH_ADO_ACTIONS, MUCH_ADO_ENCODER = {"actions": "absolute"}, {"encoder": "resnet18"}

@@ -139,7 +139,8 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
     """A preset generates as many as it likes; a file is taken whole unless its user says otherwise."""
     file = tmp_path / "file.hdf5"
     file.touch()
-    for name, (ph, mh) in {"quick": (100, 100), "cpu": (150, 300), "paper": (200, 300)}.items():
+    counts = {"quick": (100, 100), "cpu": (150, 300), "paper": (200, 300), "much-ado": (200, 300)}
+    for name, (ph, mh) in counts.items():
         data = read("--preset", name).data
         assert (data.count("ph"), data.count("mh")) == (ph, mh)
         for argv in (["--dataset", file], ["--download"]):
@@ -155,6 +156,9 @@ def test_tables_name_what_is_not_the_papers():
     (line,) = unlike(read("--preset", "paper", *words.split()), PRESETS["paper"])
     changed = "times u-shaped (uniform); objective l1 (velocity); self distillation 0.5 (0.0)"
     assert line.endswith(f": {changed}; grid dense-jump (uniform).")
+    (line,) = unlike(read("--preset", "much-ado", "--warmup-ratio", 0.2), PRESETS["paper"])
+    assert "actions absolute (delta)" in line and "max grad norm 100.0 (None)" in line
+    assert "temperature 0.0 (1.0)" in line and "warmup" not in line
     # The weighting is that in force, which follows from the network where none is given.
     (line,) = unlike(read(), PRESETS["paper"])
     for words in ("weighting standardised (velocity)", "network mlp (chi_transformer)", "(200000)"):

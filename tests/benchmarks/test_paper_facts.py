@@ -38,7 +38,7 @@ import prior_space_rl
 import robomimic
 
 from lab import paper, timing
-from lab.options import IMAGES, PRESETS, with_parts
+from lab.options import IMAGES, PRESETS, parse, recorded, with_parts
 from lab.tasks import navigation_task
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
@@ -140,6 +140,55 @@ def test_the_recipe_from_images(monkeypatch):
     assert [(task, *adapted.data.data) for task in adapted.data.task] == list(MIMICGEN.values())
     counts = {found.data.demonstrations for found in mimicgen_tasks.FEW.values()}
     assert counts == {(facts.DEMONSTRATIONS["mimicgen"],)}
+
+
+def unlike_the_paper(presets):
+    """The options in which the preset of the public code is not the paper's."""
+    paper, other = (recorded(presets[name]) for name in ("paper", "much-ado"))
+    found = {}
+    for part, options in other.items():
+        if isinstance(options, dict):
+            found |= {name: value for name, value in options.items() if value != paper[part][name]}
+        else:
+            assert options == paper[part]
+    return found
+
+
+@pytest.mark.parametrize("name", [*SCRIPTS, "joint_targets"])
+def test_the_preset_of_the_public_code_from_the_state(name, monkeypatch):
+    # Tasks of one's own have actions of their own.
+    actions = {} if name in ("pusht", "joint_targets") else facts.MUCH_ADO_ACTIONS
+    assert unlike_the_paper(presets_of(name, monkeypatch)) == facts.MUCH_ADO | actions
+
+
+def test_the_preset_of_the_public_code_from_images(monkeypatch):
+    pytest.importorskip("torchvision")
+    monkeypatch.setattr("lab.tasks.require_rendering", lambda: None)
+    argv = ["--preset", "much-ado", "--obs", "image", "--out", "out"]
+    adapted = {
+        name: with_parts(with_parts(PRESETS[name], **IMAGES[name]), data={"obs": "image"})
+        for name in ("paper", "much-ado")
+    }
+    for presets in (adapted, mimicgen_tasks.FEW):
+        assert unlike_the_paper(presets) == facts.MUCH_ADO | facts.MUCH_ADO_ENCODER
+        assert presets["much-ado"].data.actions == "delta"
+    read = parse(PRESETS, argv, "robomimic", None)
+    assert with_parts(read, run=vars(adapted["much-ado"].run)) == adapted["much-ado"]
+    network = read.network.make(7, 9, 8, {"agentview_image": 84})
+    observation_layers = network.network.observation_layers
+    assert (observation_layers, network.encoder.backbone) == (2, "resnet18")
+
+
+def test_what_the_preset_of_the_public_code_builds():
+    network = PRESETS["much-ado"].network.make(10, 9, 8)
+    angles = network.embed_time[0].frequencies
+    assert (angles.max().item(), angles.min().item()) == (
+        1.0,
+        pytest.approx(facts.MUCH_ADO["time_frequency"]),
+    )
+    hidden = [layer for layer in network.embed_observation.modules() if isinstance(layer, nn.Linear)][:-1]
+    assert len(hidden) == facts.MUCH_ADO["observation_layers"] and hidden[0].in_features == 2 * 9
+    assert isinstance(network, ChiTransformer) and values(network, SIZES).items() <= STATE.items()
 
 
 def test_defaults_of_the_library():

@@ -125,6 +125,25 @@ def test_around_zero_the_source_is_what_the_agent_says(prior, length):
     assert anchors[0].any() and not anchors[1].any()
 
 
+def test_the_time_limit_is_that_of_the_policys_environment_unless_one_is_given(tmp_path, monkeypatch):
+    given = []
+
+    class Recorded:
+        def __init__(self, actor, make_env, *args, **options):
+            given.append(make_env.args[-1])
+
+        def run(self):
+            pass
+
+    monkeypatch.setattr(benchmark, "PriorSpaceTraining", Recorded)
+    for words, found in (("", {}), ("--horizon 20", {"horizon": 20})):
+        recipe = read(f"--task can --prior past {words}")
+        (method,) = recipe.sources.methods()
+        actor = WarmPriorActor(VelocityMLP(7, 23, 8, hidden_dim=8), method.prior(), nfe=1)
+        benchmark.learn(recipe, actor, recipe.arms(method)[0], 0, tmp_path)
+        assert given.pop() == found
+
+
 def test_papers_recipes():
     """DSRL's table of hyper-parameters; its choice for Transport is SAC."""
     known = {

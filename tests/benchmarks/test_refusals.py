@@ -66,6 +66,10 @@ def no_work(monkeypatch):
         ("prior_space_rl", "--preset unit --collectors 2", "--collectors belongs to --engine ray"),
         ("prior_space_rl", "--preset unit --prior past step", "--centre zero: step has a centre of its own"),
         ("prior_space_rl", "--preset unit --centre", "--centre needs at least one value"),
+        ("robomimic", f"--preset much-ado --task {DRIFT}:task", "has its own: add --actions delta"),
+        ("robomimic", f"{FILE} --observation-layers 2", "leave it None with the network mlp"),
+        ("robomimic", f"{FILE} --max-grad-norm 0", "max_grad_norm must be a finite number > 0, got 0.0"),
+        ("robomimic", "--preset much", "--preset must be one of quick, cpu, paper, much-ado, got 'much'"),
         ("prior_space_rl", "--preset paper", "has hyper-parameters per task: add the --task"),
     ],
 )  # fmt: skip

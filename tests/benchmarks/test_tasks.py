@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lab.tasks import DataOptions
-from tests.benchmarks.script_parts import command_line, described, options, stored, written
+from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
 from tests.data.synthetic import env_args_14, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 from tests.processes import apart
@@ -19,6 +19,7 @@ from warmprior import ImageEncoder
 from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
 from warmprior.diagnostics import encoded_windows
 from warmprior.training import load_policy
+from warmprior.training.checkpoint import load_state
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -28,7 +29,9 @@ import mimicgen_tasks
 import pusht
 import robomimic
 
-from warmprior.envs import rendering_backend
+from lab.options import Options, stored_options, with_parts
+from lab.policies import policies_of
+from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
@@ -53,6 +56,39 @@ def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validatio
     assert [load_policy(path).network.action_dim for path in paths] == [10, 10, 7, 7]
     # What reads the run later knows it as well.
     assert "Lift-PH, absolute actions" in flow(tmp_path / "absolute", validation)
+
+
+def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path, capfd):
+    small = {"hidden_dim": 12, "batch_size": 16, "iterations": 6, "checkpoints": 1, "seeds": 1, "top_k": 1}
+    few = {"preset": "much-ado", "time_limit": 24, "prior": "past", **small}
+    out = tmp_path / "run"
+    assert robomimic.main(options(dataset, out, **few)) == 0
+    (row,) = stored(out)
+    # Three chunks, which solve nothing.
+    assert (row["temperature"], row["actions"], row["mean_steps"]) == (0.0, "absolute", 24.0)
+    report = (out / "report.md").read_text()
+    assert "time limit 24 (None)" in report and "count padding True (False)" in report
+    folder = tmp_path / "policies" / row["policy"]
+    policy = load_policy(folder / "policy_000006")
+    assert policy.network.config().items() >= {"observation_layers": 2, "time_frequency": 1e-4}.items()
+    assert environment_of(policy).horizon == 24
+    recipe = load_state(folder / "state.safetensors")[1]["identity"]["config"]
+    assert recipe.items() >= {"max_grad_norm": 100.0, "count_padding": True, "warmup_ratio": 0.0}.items()
+    # Its run goes on with what it says, and with nothing else.
+    for path in (out / "results.jsonl", folder / "policy_000006" / "model.safetensors"):
+        path.unlink()
+    argv = ["--resume", "--out", str(out)]
+    said = refused(robomimic.main, [*argv, "--max-grad-norm", "10", "--no-count-padding"], capfd)
+    assert "--count-padding, --max-grad-norm" in said
+    assert robomimic.main(argv) == 0
+    (again,) = stored(out)
+    assert again | {"training_seconds": None} == row | {"training_seconds": None}
+    # Runs of another time limit share the policy, and play it to their own.
+    mine = with_parts(stored_options(Options, out, "robomimic"), run={"out": out})
+    for limit, steps in ((24, 24), (None, 40)):
+        (shared,) = policies_of(with_parts(mine, data={"time_limit": limit}))
+        assert shared.name == row["policy"] and environment_of(shared.load()).horizon == steps
+        assert shared.task().make_env().horizon == steps
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

@@ -21,8 +21,8 @@ from warmprior.training.saved import load_policy, save_policy
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
 
-def actor(tmp_path, actions="absolute"):
-    environment = environment_description(task_env_args("lift"), "ph", 2, actions)
+def actor(tmp_path, actions="absolute", horizon=None):
+    environment = environment_description(task_env_args("lift"), "ph", 2, actions, horizon=horizon)
     network = VelocityMLP(10 if actions == "absolute" else 7, 19, 4, hidden_dim=16)
     policy = WarmPriorActor(network, PastPrior(4), nfe=1, environment=environment)
     save_policy(policy, tmp_path)
@@ -39,6 +39,11 @@ def test_a_saved_policy_knows_the_space_of_its_actions(tmp_path, actions):
     assert rollout["next", "executed_steps"].flatten().tolist() == [4, 2]
     assert rollout["vla_action", "chunk"].shape[-1] == (10 if actions == "absolute" else 7)
     assert ("eef_pose" in rollout.keys()) == (actions == "absolute")  # noqa: SIM118
+
+
+def test_a_saved_policy_knows_its_time_limit(tmp_path):
+    for horizon, found in ((None, 400), (6, 6)):
+        assert environment_of(actor(tmp_path, "delta", horizon)).horizon == found
 
 
 def test_a_guided_policy_is_told_what_is_left_of_its_chunks(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from lab.tasks import navigation_task
 from warmprior import ChiTransformer, PastPrior
@@ -62,6 +63,11 @@ def test_options_of_transformers_reach_them_alone(name, value):
         )
         assert made.config() == usual.config() | {name: value} != usual.config()
     assert NetworkOptions("chi_transformer").make(2, 3, 4).config() == ChiTransformer(2, 3, 4).config()
+    seeing = NetworkOptions("chi_transformer", hidden_dim=12, encoder="small", crop_size=8, **{name: value})
+    network = seeing.make(2, 3, 4, {"camera": 10})  # behind an encoder of images
+    assert network.config()["network"][name] == value
+    images = {"state": torch.zeros(5, 2, 3), "camera": torch.zeros(5, 2, 3, 10, 10, dtype=torch.uint8)}
+    assert network(torch.rand(5), torch.randn(5, 4, 2), TensorDict(images, [5])).shape == (5, 4, 2)
     for network in ("mlp", "plain_mlp"):
         said = f"{name} belongs to chi_transformer and adaln_transformer: leave it None with .* {network}$"
         with pytest.raises(ValueError, match=said):
