@@ -51,13 +51,13 @@ test: install
 test-slow: install
 	$(PYTEST) -m slow $(ARGS)
 
-# The core alone, without simulator and extras, on any system.
+# The core, without the simulator, on any system.
 CORE := .venv-core
 test-core:
 	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv $(CORE)
-	$(CORE)/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
-	$(CORE)/bin/python -m pytest -n logical --dist loadfile $(ARGS)
+	$(CORE)/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,vision]" gymnasium scipy
+	$(CORE)/bin/python -m pytest -n logical --dist loadfile $(addprefix tests/,modules objectives transforms diagnostics rl) $(ARGS)
 
 $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 	$(PYTHON) -m venv $(GROOT)
