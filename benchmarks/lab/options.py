@@ -259,7 +259,7 @@ PRESETS: dict[str, Options] = {
     ),
 }
 # The same with the answers of the public code that the paper may stand on, Much Ado About Noising, where it
-# has others (docs/paper.md). It clips a tenth of the loss's gradient to a norm of 10.
+# has others (docs/notes/paper_readings.md). It clips a tenth of the loss's gradient to a norm of 10.
 PRESETS["much-ado"] = with_parts(
     PRESETS["paper"],
     data={"actions": "absolute"},
