@@ -17,8 +17,8 @@ GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 SVG = {"metadata": {"Date": None}}  # the same file every time
 matplotlib.rcParams["svg.hashsalt"] = "warmprior"
 QUESTIONS = (
-    ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=1", BLUE),
-    ("Are actions absolute poses\nor joint targets?", "GaussianPrior(8), nfe=3", GREY),
+    ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=3", BLUE),
+    ("Are actions absolute poses\nor joint targets of an arm?", "GaussianPrior(8), nfe=3", GREY),
     ("At most 25 demonstrations\nby a script or an expert?", "PastPrior(8), nfe=1", BLUE),
     ("More than 100 by people, and time\nfor nine evaluations per chunk?", "GaussianPrior(8), nfe=9", GREY),
 )

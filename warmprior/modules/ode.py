@@ -70,7 +70,7 @@ def _jump(grid: str) -> float | None:
 
 
 DEFAULT_NFE = 3
-"""Network evaluations per chunk by default: the best on average over the families of docs/which_source.md."""
+"""Network evaluations per chunk by default; docs/which_source.md has the reasons."""
 
 MAX_NFE = 10_000
 """More would take minutes per chunk, and look like a process that hangs."""
