@@ -16,7 +16,6 @@ import numpy as np
 from pandas import DataFrame, concat
 from results import (
     CORRELATED,
-    DATA,
     DOCS,
     GAUSSIAN,
     OUT,
@@ -36,35 +35,30 @@ from scipy.stats import rankdata
 from lab.statistics import resampled_means
 
 PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
+DOOR = "door, 25"
 FAMILIES = {  # human demonstrations and how many, and the rows of their runs
-    "door, 25": "door_20000",
+    DOOR: "door_20000",
     "Push-T, 25": "pusht_25",
     "Push-T, 50": "pusht_50",
     "Push-T, 206": "pusht_206",
 }
 
 
-def _played() -> dict[str, DataFrame]:
-    """The rows of the runs of each family, with the source's own noise."""
-    found = {name: read_played(run) for name, run in FAMILIES.items() if (DATA / f"{run}.jsonl").exists()}
-    # MIP's only noise is none; of the others this is the source as it was trained.
-    own = {
-        name: rows["noise"] == rows.groupby("source")["noise"].transform("max")
-        for name, rows in found.items()
-    }
-    return {name: rows[own[name]].assign(family=name) for name, rows in found.items()}
+def _played(family: str) -> DataFrame:
+    """The rows of a family's runs with the noise that the source was trained with; MIP's is none."""
+    rows = read_played(FAMILIES[family]).assign(family=family)
+    return rows[rows["noise"] == rows.groupby("source")["noise"].transform("max")]
 
 
 def pairs() -> DataFrame:
-    """Episodes won and lost of the Gaussian source's with the same NFE, over all families that have both."""
-    parts = [read("pusht").dropna(subset=["won"])]
-    for rows in _played().values():
-        both = rows.merge(rows[rows["source"] == GAUSSIAN], on=["seed", "nfe"], suffixes=("", "_base"))
-        for ahead, name in (1, "won"), (-1, "lost"):
-            differences = both["solved"] - both["solved_base"]
-            both[name] = [(ahead * difference > 0).sum() for difference in differences]
-        parts.append(both[both["source"] != GAUSSIAN])
-    return concat(parts).groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
+    """Episodes won and lost of the Gaussian source's with the same NFE, over all families."""
+    rows = _played(DOOR)
+    both = rows.merge(rows[rows["source"] == GAUSSIAN], on=["seed", "nfe"], suffixes=("", "_base"))
+    for ahead, name in (1, "won"), (-1, "lost"):
+        differences = both["solved"] - both["solved_base"]
+        both[name] = [(ahead * difference > 0).sum() for difference in differences]
+    known = concat([read("pusht").dropna(subset=["won"]), both[both["source"] != GAUSSIAN]])
+    return known.groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
 
 
 def trials() -> DataFrame:
@@ -74,7 +68,10 @@ def trials() -> DataFrame:
         family="Push-T, " + pusht["demonstrations"].astype(str), rate=pusht["seed_success"].str.split()
     ).explode("rate")
     pusht["successes"] = (pusht["rate"].astype(float) * pusht["episodes"] / 100).round().astype(int)
-    return concat([pusht, *_played().values()])[["family", "source", "nfe", "successes", "episodes"]]
+    pusht["seed"] = pusht.groupby(["family", "source", "nfe"]).cumcount()
+    rows = concat([pusht, *map(_played, FAMILIES)])
+    # The first seed of Push-T with 25 was trained twice, to compare versions.
+    return rows.drop_duplicates(["family", "source", "nfe", "seed"])
 
 
 def standings() -> DataFrame:
@@ -89,6 +86,7 @@ def standings() -> DataFrame:
         )
         rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in families.items()}
         lines.append({"source": source, "nfe": nfe, "mean": np.mean(list(rates.values())), **rates})
+        lines[-1]["trainings"] = len(part)
     frame, draws = DataFrame(lines), np.stack(draws)
     ends = {"mean": draws, "rank": rankdata(-draws, axis=0)}
     frame["rank"] = rankdata(-frame["mean"], "min")
@@ -117,13 +115,17 @@ def draw() -> None:
 def table() -> str:
     """The standings, in Markdown."""
     names, told = ("mean", *FAMILIES), pairs()
-    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost |", "|---" * (4 + len(names)) + "|"]
+    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | trainings |"]
+    text.append("|---" * (5 + len(names)) + "|")
     for _, row in standings().iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
         pair = told.loc[row["source"], row["nfe"]] if (row["source"], row["nfe"]) in told.index else None
         rates = [f"{row[name] + 1e-6:.0f}" for name in names]
         cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
-        text.append(f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} |")
+        text.append(
+            f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} | "
+            f"{row['trainings']} |"
+        )
     return "\n".join(text) + "\n"
 
 
