@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def check_finite_numbers(**values: Any) -> None:
-    """Raise ValueError for the first of them that is no finite number."""
+    """Raise ValueError for the first value that is not a finite number."""
     for name, value in values.items():
         try:
             finite = not isinstance(value, bool) and math.isfinite(value)
@@ -24,21 +24,21 @@ def check_finite_numbers(**values: Any) -> None:
 
 
 def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
-    """Raise ValueError for the first of them that is no whole number of at least ``least``."""
+    """Raise ValueError for the first value that is not a whole number of at least ``least``."""
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
 def check_positive(**values: float) -> None:
-    """Raise ValueError for the first of them that is not a finite number > 0."""
+    """Raise ValueError for the first value that is not a finite number > 0."""
     for name, value in values.items():
         if not (value > 0 and math.isfinite(value)):
             raise ValueError(f"{name} must be a finite number > 0, got {value}")
 
 
 def check_between(low: float, high: float, /, **values: float) -> None:
-    """Raise ValueError for the first of them that is not in the interval, ends included."""
+    """Raise ValueError for the first value that is not in the interval, ends included."""
     for name, value in values.items():
         if not low <= value <= high:
             raise ValueError(f"{name} must be between {low} and {high}, got {value}")
@@ -57,14 +57,14 @@ def check_shape(name: str, value: Any, expected: Sequence[int]) -> None:
 
 
 def check_keys(place: Any, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
-    """Raise KeyError for needed keys that a tensordict or spec lacks, and hint at who writes them."""
+    """Raise KeyError, with a hint, for needed keys that a tensordict or spec lacks."""
     missing = [key for key in needed if place.get(key, None) is None]
     if missing:
         raise KeyError(f"{whose} needs the keys {list(needed)}; missing: {missing}{hint}")
 
 
 def check_positions(key: NestedKey, chunk: Tensor, prior: Any) -> None:
-    """A ``ValueError`` if chunks ``[*B, P, d_a]`` have other positions than a prior predicts."""
+    """Raise ValueError if chunks ``[*B, P, d_a]`` have another length than a prior predicts."""
     if chunk.shape[-2] != prior.prediction_length:
         raise ValueError(
             f"{key} has {chunk.shape[-2]} positions, but {prior} predicts {prior.prediction_length}: make "
@@ -88,7 +88,7 @@ def check_finite(
     tensors: Mapping[Any, Tensor],
     cause: str = "the training has diverged; lower the learning rate or check the rewards",
 ) -> None:
-    """Stop at NaN or infinity with a ``FloatingPointError`` that names the tensors and what to check."""
+    """Raise FloatingPointError at NaN or infinity, with the tensors' names and what to check."""
     wrong = [str(name) for name, value in tensors.items() if not torch.isfinite(value).all()]
     if wrong:
         more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""

@@ -1,8 +1,8 @@
-"""History: what the robot did and what it planned to do, as a value with one layout.
+"""The history: what the robot did and what it planned to do, as a value with one layout.
 
 Training windows, environments, the executor and LeRobot's adapter write the same layout under
-:data:`warmprior.keys.HISTORY`, and a prior reads it (:meth:`Prior.mean`). So a mean is the same function of
-the same values everywhere.
+:data:`warmprior.keys.HISTORY`, and a prior reads it (:meth:`Prior.mean`), so that a prior's mean is computed
+from the same values everywhere.
 
 =====================  =========================  =====================================================
 entry                  shape                      meaning, in the normalised action space
@@ -10,14 +10,14 @@ entry                  shape                      meaning, in the normalised act
 ``"actions"``          ``[*B, H, d_a]`` float     the last ``H`` executed actions, the oldest first; 0
                                                   where the episode has none
 ``"steps"``            ``[*B, 1]`` int64          how many of them are real, counted from the newest
-``"forecast"``         ``[*B, P, d_a]`` float     what the last prediction says of the next ``P`` steps,
-                                                  0 behind its end
-``"forecast_steps"``   ``[*B, 1]`` int64          how many of them it reaches
+``"forecast"``         ``[*B, P, d_a]`` float     the last prediction for the next ``P`` steps, 0 after its
+                                                  end
+``"forecast_steps"``   ``[*B, 1]`` int64          how many of them it covers
 =====================  =========================  =====================================================
 
 A training window holds the target's first ``P - H`` actions as a perfect forecast (Eq. 3), and no more of
-the target. At decisions after ``k < H`` actions the forecast reaches ``P - k`` (Eq. 4): priors read its first
-``P - H``, Real-Time Chunking reads all of it.
+the target. At decisions after ``k < H`` actions the forecast covers ``P - k`` steps (Eq. 4): priors read its
+first ``P - H``, Real-Time Chunking reads all of it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def history_keys(history_key: NestedKey = keys.HISTORY) -> list[NestedKey]:
 def cold_history(
     batch_size: Any, history_length: int, prediction_length: int, action_dim: int, **like: Any
 ) -> TensorDict:
-    """The history of robots that have not acted yet, with ``dtype`` and ``device`` as in ``torch.zeros``.
+    """Return the history of robots that have not acted yet; ``dtype`` and ``device`` as in ``torch.zeros``.
 
     Examples:
         >>> from warmprior.history import cold_history
@@ -69,18 +69,18 @@ def cold_history(
 
 
 def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
-    """The history after some actions of a chunk were executed. Nothing else moves a history.
+    """Return the history after some actions of a chunk were executed, in the history's dtypes.
 
-    Dtypes stay those of the history. A row that executes nothing keeps its actions, and its forecast becomes
-    the chunk; after a partial step the caller puts the history of resting rows back.
+    A row that executes nothing keeps its actions, and its forecast becomes the chunk; after a partial step
+    the caller restores the history of resting rows.
 
     Args:
-        history: before the decision, ``[*B]``.
+        history: the history before the decision, ``[*B]``.
         chunk: the chunk being executed, ``[*B, P, d_a]``.
-        executed: how many actions of it were executed, at most as many as are remembered, int64 ``[*B, 1]``.
+        executed: number of its actions that were executed, at most ``H``, int64 ``[*B, 1]``.
 
     Raises:
-        ValueError: if the chunk has another length than the forecast, or ``executed`` is out of range.
+        ValueError: if chunk and forecast differ in length, or ``executed`` is out of range.
 
     Examples:
         >>> import torch
@@ -94,8 +94,8 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
     remembered, length = before.shape[-2], shape[-2]
     if chunk.shape != shape:
         raise ValueError(
-            f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast {tuple(shape)}: both need "
-            "one prediction length"
+            f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast {tuple(shape)}: give both "
+            "the same prediction length"
         )
     low, high = map(int, torch.aminmax(executed)) if executed.numel() else (0, 0)
     if not 0 <= low <= high <= min(remembered, length):
@@ -104,7 +104,7 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
             f"{remembered} and the chunk has {length}: execute between 0 and {min(remembered, length)}"
         )
     chunk = chunk.to(before.dtype)
-    # Of [actions, chunk, zeros] the last executed actions begin at k, and the rest of the chunk follows.
+    # In [actions, chunk, zeros] the last executed actions begin at k, and the rest of the chunk follows.
     line = torch.cat([before, chunk, torch.zeros_like(chunk[..., :remembered, :])], -2)
     if low == high:  # one robot, or all in step: a slice, at a third of the time
         moved = line[..., low : low + remembered + length, :]
@@ -117,9 +117,9 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
 
 
 def caught_up(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
-    """As :func:`advance`, where up to all of a chunk was executed, and possibly more than is remembered.
+    """Return the history after up to all actions of a chunk, possibly more than it remembers.
 
-    That happens on robots, which go on while a decision is late.
+    This extends :func:`advance` to robots that go on while a decision is late.
 
     Examples:
         >>> import torch
@@ -139,10 +139,10 @@ def caught_up(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> Tenso
 
 
 def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: int) -> TensorDict:
-    """The history of a training window (Eq. 3).
+    """Return the history of a training window (Eq. 3).
 
     Args:
-        before: the actions before the window, ``[*B, H, d_a]``, 0 before the episode.
+        before: the actions before the window, ``[*B, H, d_a]``, 0 before the episode's start.
         steps: steps since the episode began, int64 ``[*B, 1]``.
         target: the chunk to predict, ``[*B, P, d_a]``.
         chunk_length: ``H``.
@@ -154,14 +154,16 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
         >>> window_history(torch.zeros(2, 1), torch.tensor([0]), target, 2)["forecast"].flatten().tolist()
         [1.0, 2.0, 0.0, 0.0]
     """
-    known = target.shape[-2] - chunk_length
-    forecast = torch.cat([target[..., :known, :], torch.zeros_like(target[..., known:, :])], -2)
+    ahead = target.shape[-2] - chunk_length
+    forecast = torch.cat([target[..., :ahead, :], torch.zeros_like(target[..., ahead:, :])], -2)
     steps = steps.clamp(max=before.shape[-2])
-    return _history(target.shape[:-2], before, steps, forecast, torch.full_like(steps, known))
+    return _history(target.shape[:-2], before, steps, forecast, torch.full_like(steps, ahead))
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
-    """A history ``[*B]`` with some rows, bool ``[*B]``, made cold: of new episodes, or withheld in training.
+    """Return a history ``[*B]`` with some rows, bool ``[*B]``, made cold.
+
+    These are rows of new episodes, or rows withheld in training.
 
     Examples:
         >>> import torch
@@ -181,12 +183,12 @@ def _history(batch_size: Any, *values: Tensor) -> TensorDict:
 
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
-    """Refuse a history that is missing or incomplete (``KeyError``), or of other lengths (``ValueError``)."""
+    """Raise KeyError if a history is missing or incomplete, ValueError if its lengths differ."""
     writers = ". ActionHistory writes it in an environment, ActionWindow in a replay buffer"
     check_keys(TensorDict() if history is None else history, ENTRIES, f"the history of {whose}", writers)
     lengths = history.get("actions").shape[-2], history.get("forecast").shape[-2]
     if lengths != (history_length, prediction_length):
         raise ValueError(
             f"{whose} needs {history_length} remembered actions and forecasts of {prediction_length}, but "
-            f"the history has {lengths[0]} and {lengths[1]}: make windows and environment for equal lengths"
+            f"the history has {lengths[0]} and {lengths[1]}: make windows and environment for these lengths"
         )

@@ -41,7 +41,7 @@ An observation with images has several entries, nested under :data:`OBSERVATION`
 ``"agentview_image"``.
 
 :data:`HISTORY` is what the robot did and planned to do (:mod:`warmprior.history`). Data, environments and
-robots write it alike; the policy writes :data:`LOC`, :data:`WARM` and :data:`NOISE`. :data:`DELAY` is the
+robots write it; the policy writes :data:`LOC`, :data:`WARM` and :data:`NOISE`. :data:`DELAY` is the
 number of control steps during which the last chunk is still executed while the next one is computed; 0
 without a last chunk.
 

@@ -15,8 +15,8 @@ from torch.nn.functional import normalize
 from warmprior.io.extras import require
 
 HAND_TO_SITE = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
-"""From the hand's body, whose quaternion robomimic's observations have, to the gripper's site, which
-robosuite's controllers move: -90 degrees about the z axis that both share."""
+"""The rotation from the hand's body, whose quaternion robomimic's observations have, to the gripper's site,
+which robosuite's controllers move: -90 degrees about their common z axis."""
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
@@ -48,11 +48,11 @@ def matrix_to_rotvec(matrix: Tensor) -> Tensor:
 
 
 def _by_scipy(read: str, value: Tensor, write: str, form: tuple[int, ...]) -> Tensor:
-    """What scipy's ``Rotation`` makes of one form of rotations, ``[..., *form]``, without gradients."""
+    """Convert rotations ``[..., *form]`` with scipy's ``Rotation``, without gradients."""
     rotations = require("scipy.spatial.transform", "sim").Rotation
     flat = value.detach().reshape(-1, *form).cpu().double().numpy()
-    found = torch.from_numpy(getattr(getattr(rotations, read)(flat), write)()).to(value)
-    return found.reshape(*value.shape[: value.ndim - len(form)], *found.shape[1:])
+    converted = torch.from_numpy(getattr(getattr(rotations, read)(flat), write)()).to(value)
+    return converted.reshape(*value.shape[: value.ndim - len(form)], *converted.shape[1:])
 
 
 def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
@@ -61,9 +61,9 @@ def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
 
 
 def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
-    """Turn any six numbers ``[..., 6]`` into the rotation matrix they mean, by Gram-Schmidt.
+    """Turn any six numbers ``[..., 6]`` into a rotation matrix, by Gram-Schmidt.
 
-    The two rows need be neither of unit length nor orthogonal, but not parallel.
+    The two rows need be neither of unit length nor orthogonal, but must not be parallel.
 
     Examples:
         >>> import torch

@@ -248,6 +248,6 @@ def test_stored_weights_that_are_damaged_or_hold_code(tmp_path, monkeypatch, sto
     else:
         Planted.folder = str(tmp_path / "ran")
         torch.save({"conv1.weight": stored}, path)
-    with pytest.raises(OSError, match=r"cannot be had \(.*\): connect once, put an intact resnet18"):
+    with pytest.raises(OSError, match=r"weights of ResNet-18.*\(.*\): connect once, put an intact resnet18"):
         load_imagenet(encoder_of(backbone="resnet18"))
     assert not (tmp_path / "ran").exists()

@@ -26,13 +26,13 @@ from warmprior.modules.registry import Registered
 class StartPoint(Registered, nn.Module):
     """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
-    The flow is trained from the prior's source as usual; at decisions integration starts on the way. A start
-    point is trained before the flow, and saved with the policy (``start`` of
+    The flow is trained from the prior's source as usual; at decisions integration starts from this point. A
+    start point is trained before the flow, and saved with the policy (``start`` of
     :class:`~warmprior.WarmPriorActor`).
 
     Attributes:
         time: ``s``.
-        noise_share: standard deviation of the point for source noise of 1.
+        noise_share: standard deviation of the point per unit of source noise.
 
     Examples:
         >>> from warmprior import StartPoint
@@ -50,11 +50,11 @@ class StartPoint(Registered, nn.Module):
     noise_share: float
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``; arguments as for a prior."""
+        """Return the point's mean, ``[*B, P, d_a]``, around which an agent searches."""
         raise NotImplementedError
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """The point, ``[*B, P, d_a]``, of a draw of the prior's source, ``[*B, P, d_a]``."""
+        """Map a source sample ``[*B, P, d_a]`` to the start point ``[*B, P, d_a]``."""
         raise NotImplementedError
 
 
@@ -63,17 +63,17 @@ class PriorSampler(TensorDictModuleBase):
 
     Args:
         prior: the source distribution.
-        start: the point from which samplers start, if that is not the source itself.
+        start: the point from which integration starts; the source sample by default.
         observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
             :meth:`~Prior.distribution` read it.
         history_key: key of the history (:mod:`warmprior.history`).
         source_key: where to write ``"loc"``, ``"warm"`` and ``"noise"``.
-        generator: source of randomness; per call: ``sampler(data, generator=...)``. Worker processes take
-            none, since all of them would draw the same noise.
+        generator: source of randomness, also per call: ``sampler(data, generator=...)``. A sampler with a
+            generator cannot go to worker processes, since all of them would draw the same noise.
 
     Raises:
         KeyError: if an entry of the history is missing.
-        ValueError: if the history has other lengths than the prior.
+        ValueError: if the history's lengths differ from the prior's.
 
     Examples:
         >>> import torch
@@ -116,7 +116,7 @@ class PriorSampler(TensorDictModuleBase):
         return super().__getstate__()
 
     def source(self, tensordict: TensorDictBase) -> Source:
-        """Return the source of decisions or windows, ``[*B]``."""
+        """Return the source for decisions or windows ``[*B]``."""
         return self.prior.distribution(*self._inputs(tensordict))
 
     @dispatch(auto_batch_size=False)
@@ -126,7 +126,7 @@ class PriorSampler(TensorDictModuleBase):
         generator: torch.Generator | None = None,
         temperature: float | None = None,
     ) -> TensorDictBase:
-        """Write the mean, the warm positions, and the sample, with noise of a temperature."""
+        """Write the mean, the mask of warm positions, and a sample at a temperature."""
         source, generator = self.source(tensordict), self.generator if generator is None else generator
         point = source.sample(generator, noise_factor(temperature))
         if self.start is not None:
@@ -144,46 +144,45 @@ USUAL_KEYS = {"history_key": keys.HISTORY, "source_key": keys.SOURCE, "chunk_key
 
 
 def check_usual_keys(policy: Any, whose: str) -> None:
-    """Raise ValueError if a policy has keys of its own where only the usual ones are known."""
+    """Raise ValueError if a policy has keys of its own where only the default ones are supported."""
     own = getattr(policy, "tensor_keys", USUAL_KEYS)
     if changes := [f"{name}={key!r}" for name, key in USUAL_KEYS.items() if own[name] != key]:
-        raise ValueError(f"{whose} takes the usual keys: give it policy.replace({', '.join(changes)})")
+        raise ValueError(f"{whose} needs the default keys: give it policy.replace({', '.join(changes)})")
 
 
 class WarmPriorActor(TensorDictModuleBase):
-    """Flow-matching policy with a choice of source: ``(observation, history) -> (loc, warm, noise, chunk)``.
+    """A flow-matching policy from any source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
-    Composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history that
-    it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it works
-    unchanged in ``env.rollout``, collectors, batched environments and replay buffers. Under
-    ``ExplorationType.DETERMINISTIC`` the flow starts at the source's mean; otherwise at a draw, for which you
-    seed the generator.
+    It composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history
+    that it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it
+    works unchanged in ``env.rollout``, collectors, batched environments and replay buffers. The flow starts
+    at the source's mean under ``ExplorationType.DETERMINISTIC``, and otherwise at a random draw; pass a
+    seeded generator to make it reproducible.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
         prior: the source distribution.
-        start: the point from which samplers start, if that is not the source itself.
+        start: the point from which integration starts; the source sample by default.
         guidance: makes chunks continue the one being executed; none by default.
-        normalizer: the normaliser of the data; its :meth:`~warmprior.Normalizer.env_transforms` go next to
-            the base environment.
+        normalizer: the normaliser of the data. Its :meth:`~warmprior.Normalizer.env_transforms` belong
+            directly after the base environment.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             (``python -m warmprior evaluate FOLDER``).
-        generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
+        generator: source of the sampler's randomness, also per call: ``actor(data, generator=...)``.
         observation_key: key of the observation, ``[*B, To, d_o]``, or of several nested under it;
-            :data:`warmprior.keys.CONDITIONED` where the network sees the last actions
+            :data:`warmprior.keys.CONDITIONED` if the network sees the last actions
             (:class:`~warmprior.HistoryObservation`).
         history_key: key of the history.
         source_key: where ``"loc"``, ``"warm"`` and ``"noise"`` are written.
-        chunk_key: where the chunk is written. With keys of their own, several policies share an environment
+        chunk_key: where the chunk is written. Policies that share an environment need different keys
             (:class:`~warmprior.ChunkStep`).
-        spec: of the chunk, or of several outputs by key, as of TorchRL's actors; none by default, and not
-            saved.
+        spec: TorchRL's spec of the chunk, or of several outputs by key; none by default. It is not saved.
         **sampling: options of :class:`Sampling`, such as ``nfe`` and ``temperature``; the number of network
-            evaluations also per call: ``actor(data, nfe=1)``.
+            evaluations can also be set per call: ``actor(data, nfe=1)``.
 
     Raises:
-        ValueError: if the network was built for another prediction length than the prior's, or see
-            :class:`ODEActor`.
+        ValueError: if network and prior have different prediction lengths, or an option does not fit
+            (:class:`ODEActor`).
 
     Examples:
         >>> import torch
@@ -260,7 +259,7 @@ class WarmPriorActor(TensorDictModuleBase):
 
     @property
     def start(self) -> StartPoint | None:
-        """The point from which samplers start, if that is not the source itself."""
+        """The point from which integration starts, or ``None`` for the source sample."""
         return self.sampler.start
 
     @property
@@ -270,29 +269,29 @@ class WarmPriorActor(TensorDictModuleBase):
 
     @property
     def sampling(self) -> Sampling:
-        """How a chunk is drawn."""
+        """The options for drawing a chunk."""
         return self.ode.sampling
 
     @property
     def observation_key(self) -> NestedKey:
-        """Key of what the network sees."""
+        """The key of what the network sees."""
         return self.ode.observation_key
 
     @property
     def history_key(self) -> NestedKey:
-        """Key of the history."""
+        """The key of the history."""
         return self.sampler.history_key
 
     @property
     def sees_history(self) -> bool:
-        """Whether the network sees the last actions, see :class:`~warmprior.HistoryObservation`."""
+        """True if the network sees the last actions, see :class:`~warmprior.HistoryObservation`."""
         return self.observation_key == keys.CONDITIONED
 
     @dispatch(auto_batch_size=False)
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
-        """Sample the source and integrate it to the chunk."""
+        """Draw a source sample and integrate it to the chunk."""
         drawn = self.sampler(tensordict, generator=generator, temperature=self.sampling.temperature)
         return self.integrate(drawn, nfe=nfe)
 
@@ -302,7 +301,7 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.ode(tensordict, nfe=nfe, sigma=sigma)
 
     def replace(self, **changes: Any) -> WarmPriorActor:
-        """Return a copy of the policy, with the same parts, and some constructor arguments changed.
+        """Return a copy of the policy that shares its parts, with some constructor arguments changed.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

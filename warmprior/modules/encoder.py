@@ -1,4 +1,4 @@
-"""Encoders of observations that hold images, and velocity networks behind them."""
+"""Encoders of observations with images, and velocity networks that use them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Backbone = Literal["resnet18", "small"]
 
 _CHANNEL_MEAN = (0.485, 0.456, 0.406)
 _CHANNEL_DEVIATION = (0.229, 0.224, 0.225)
-"""Of ImageNet's pixels in [0, 1], which its weights expect."""
+"""The statistics of ImageNet's pixels in [0, 1], which its weights expect."""
 
 _SMALL_FEATURES = 64
 
@@ -54,24 +54,24 @@ def _small(crop_size: int) -> tuple[nn.Module, int]:
 
 
 class ImageEncoder(nn.Module):
-    """Encodes an observation of images and a vector: one vector per observation step.
+    """An encoder of images and a vector into one vector per observation step.
 
     Every camera has its own network, ResNet-18 with group norm as in the paper (Table 3), whose features are
-    appended to the vector. In training mode it sees a random window of the image, the same one for all ``To``
+    appended to the vector. In training mode it sees a random crop of the image, the same one for all ``To``
     images of a camera and drawn by PyTorch's global generator; otherwise the central one. Pixels are scaled
     by ImageNet's statistics.
 
     Args:
         cameras: names of the images in the observation.
-        state_dim: width of the vector ``"state"`` in it; 0 if there is none.
+        state_dim: width of the observation's vector ``"state"``; 0 if there is none.
         image_size: side of the images in pixels.
-        crop_size: side of the window.
+        crop_size: side of the crop in pixels.
         backbone: ``"resnet18"``, or ``"small"``: three convolutions and a linear layer, for small budgets.
-        share: one network for all cameras.
+        share: True uses one network for all cameras.
 
     Raises:
-        ValueError: if there are no cameras or one is named twice, or for an option out of range.
-        ImportError: if ResNet-18 is asked for and torchvision is missing.
+        ValueError: if there are no cameras, one is named twice, or an option is out of range.
+        ImportError: if the backbone is ResNet-18 and torchvision is missing.
 
     Examples:
         >>> import torch
@@ -118,7 +118,7 @@ class ImageEncoder(nn.Module):
             self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
 
     def config(self) -> dict[str, Any]:
-        """Constructor arguments as JSON holds them."""
+        """Return the constructor arguments as JSON holds them."""
         return {
             "cameras": list(self.cameras),
             "state_dim": self.state_dim,
@@ -129,14 +129,14 @@ class ImageEncoder(nn.Module):
         }
 
     def forward(self, observation: TensorDictBase) -> Tensor:
-        """The vector, and the features of the cameras in their order, ``[*B, To, observation_dim]``.
+        """Return the vector followed by the cameras' features in order, ``[*B, To, observation_dim]``.
 
         The observation ``[*B]`` has ``"state"`` ``[*B, To, state_dim]`` and images uint8
         ``[*B, To, 3, image_size, image_size]`` under the names of the cameras.
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if one has another shape, or images are not uint8.
+            ValueError: if an entry has another shape, or an image is not uint8.
         """
         self._check(observation)
         parts = [observation[keys.STATE]] if self.state_dim else []
@@ -151,7 +151,7 @@ class ImageEncoder(nn.Module):
         return torch.cat(parts, -1)
 
     def _cropped(self, images: Tensor) -> Tensor:
-        """Windows of images ``[B, To, 3, h, w]``."""
+        """Return crops of images ``[B, To, 3, h, w]``."""
         size, room = self.crop_size, self.image_size - self.crop_size
         if not self.training:
             return images[..., room // 2 : room // 2 + size, room // 2 : room // 2 + size]
@@ -173,7 +173,7 @@ class ImageEncoder(nn.Module):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of one step's entries, in the order in which they are encoded."""
+        """The shapes of one step's entries, in the order in which they are encoded."""
         vector: dict[str, tuple[int, ...]] = {keys.STATE: (self.state_dim,)} if self.state_dim else {}
         return vector | dict.fromkeys(self.cameras, (3, self.image_size, self.image_size))
 
@@ -189,7 +189,7 @@ class ImageEncoder(nn.Module):
 
 
 def imagenet_weights() -> dict[str, Tensor]:
-    """ImageNet's weights of ResNet-18, which torchvision downloads once.
+    """Return ImageNet's weights for ResNet-18, which torchvision downloads once.
 
     Raises:
         OSError: if the weights are not stored here and cannot be downloaded, or the stored file is damaged.
@@ -203,23 +203,23 @@ def imagenet_weights() -> dict[str, Tensor]:
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
     try:
-        # Tensors alone: a pickled file could hold code, which would run.
+        # weights_only, because a pickled file could hold code, which would run.
         return weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
-    # An interrupted or wrong download, or a stored file that is cut, empty or holds no weights.
+    # Raised for an interrupted or wrong download, and a stored file that is cut, empty or no weights.
     except (OSError, HTTPException, RuntimeError, UnpicklingError, EOFError) as error:
         reason = str(error).partition("\n")[0].rstrip(". ") or type(error).__name__
         raise OSError(
-            f"ImageNet's weights of ResNet-18 cannot be had ({reason}): connect once, put an intact "
+            f"ImageNet's weights of ResNet-18 cannot be loaded ({reason}): connect once, put an intact "
             f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints, or start from random "
             "weights (encoder='resnet18')"
         ) from error
 
 
 def load_imagenet(encoder: ImageEncoder) -> None:
-    """Give the ResNets of an encoder the weights of ImageNet, in place; group norm starts from no effect.
+    """Load ImageNet's weights into the ResNets of an encoder, in place; group norm keeps its initial values.
 
     Raises:
-        ValueError: if it has another backbone.
+        ValueError: if the encoder has another backbone.
         OSError: see :func:`imagenet_weights`.
 
     Examples:
@@ -234,10 +234,10 @@ def load_imagenet(encoder: ImageEncoder) -> None:
         raise ValueError(f"ImageNet's weights are for resnet18, not for {encoder.backbone!r}")
     weights = imagenet_weights()
     for network in encoder.networks:
-        mine = network.state_dict()
-        # Those of the convolutions: batch norm's have the names of group norm's.
-        taken = {name: weights[name] for name in mine if mine[name].ndim == 4}
-        network.load_state_dict(mine | taken)
+        state = network.state_dict()
+        # Convolutions only: batch norm's weights have the same names as group norm's.
+        convolutions = {name: weights[name] for name in state if state[name].ndim == 4}
+        network.load_state_dict(state | convolutions)
 
 
 class VisionNetwork(VelocityNetwork):
@@ -247,11 +247,11 @@ class VisionNetwork(VelocityNetwork):
     first and pass the result on.
 
     Args:
-        encoder: of observations; or its ``config()``.
-        network: of the velocity, built for ``encoder.observation_dim``; or its ``config()``.
+        encoder: encoder of observations, or its ``config()``.
+        network: velocity network, built for ``encoder.observation_dim``, or its ``config()``.
 
     Raises:
-        ValueError: if the network was built for other observations.
+        ValueError: if the network was built for observations of another width.
 
     Examples:
         >>> import torch
@@ -285,9 +285,9 @@ class VisionNetwork(VelocityNetwork):
         self.encoder, self.network = encoder, network
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """The encoded observation, ``[B, To, d_o]``; an encoded one is returned as it is."""
+        """Return the encoded observation ``[B, To, d_o]``; an encoded one is returned unchanged."""
         return self.encoder(observation) if isinstance(observation, TensorDictBase) else observation
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor | TensorDictBase) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         return self.network(t, a, self.encode(observation))

@@ -11,7 +11,7 @@ from warmprior.modules.registry import Registered
 class Interpolant(Registered):
     r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.
 
-    Subclasses give :meth:`coefficients` and, for files, a ``name``. The coefficients must satisfy
+    Subclasses define :meth:`coefficients` and, for files, a ``name``. The coefficients must satisfy
     :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and
     ends at the data.
 
@@ -37,17 +37,17 @@ class Interpolant(Registered):
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        r"""Point on the path and its velocity :math:`\dot\alpha a_0 + \dot\beta a_1`, each ``[*B, P, d_a]``.
+        r"""Return the point on the path and its velocity :math:`\dot\alpha a_0 + \dot\beta a_1`.
 
-        Source and data are ``[*B, P, d_a]``, the times ``[*B]``. The generator is of the noise of a path that
-        has some.
+        Source, data and both results are ``[*B, P, d_a]``, the times ``[*B]``. Only a path with noise uses
+        the generator.
         """
         alpha, beta, d_alpha, d_beta = self.coefficients(t[..., None, None])
         return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
 
 
 class LinearInterpolant(Interpolant):
-    r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
+    r"""The paper's straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023).
 
     Examples:
         >>> from warmprior import LinearInterpolant
@@ -61,6 +61,6 @@ class LinearInterpolant(Interpolant):
     name = "linear"
 
     def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Coefficients of the straight line."""
+        """Return the coefficients of the straight line."""
         one = torch.ones_like(t)
         return 1 - t, t, -one, one

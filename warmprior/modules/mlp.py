@@ -10,7 +10,7 @@ from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 
 
 class _Block(nn.Module):
-    """Pre-norm residual block of two layers, modulated by the time."""
+    """A pre-norm residual block of two layers, modulated by the time."""
 
     def __init__(self, dim: int, time_dim: int) -> None:
         super().__init__()
@@ -28,13 +28,13 @@ class _Block(nn.Module):
 
 
 class VelocityMLP(VelocityNetwork):
-    """Residual multi-layer perceptron on the flattened chunk and observation, modulated by the time.
+    """A residual multi-layer perceptron on the flattened chunk and observation, modulated by the time.
 
-    Time scales and shifts the input of every block (adaptive layer norm, Peebles and Xie, 2023, without their
-    gate), from no effect at first. Training at ``t = 0``, the only time that a one-step sampler evaluates,
-    then interferes little with other times. The observation has an encoder of its own, which lowers the
+    The time scales and shifts the input of every block (adaptive layer norm, Peebles and Xie, 2023, without
+    their gate), initially without effect. Training at ``t = 0``, the only time that a one-step sampler
+    evaluates, then interferes little with other times. A separate encoder of the observation lowers the
     held-out error on robot tasks by 2 to 3 percent. Wrap the network in a
-    :class:`~warmprior.PreconditionedNetwork` wherever there are data to fit one.
+    :class:`~warmprior.PreconditionedNetwork` if there are data to fit one.
 
     Args:
         action_dim: ``d_a``.
@@ -83,7 +83,7 @@ class VelocityMLP(VelocityNetwork):
         self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, chunk))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         time = self.embed_time(t)
         x = self.embed_chunk(a.flatten(1)) + self.encode_observation(observation.flatten(1))
@@ -93,7 +93,7 @@ class VelocityMLP(VelocityNetwork):
 
 
 class PlainMLP(VelocityNetwork):
-    """Four layers on time, chunk and observation side by side: the network of the paper's toy (Fig. 5).
+    """The network of the paper's toy task (Fig. 5): four layers on concatenated time, chunk and observation.
 
     Args:
         action_dim: ``d_a``.
@@ -126,6 +126,6 @@ class PlainMLP(VelocityNetwork):
         self.layers = MLP(inputs, chunk, depth=3, num_cells=hidden_dim, activation_class=nn.GELU)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         return self.layers(t[:, None], a.flatten(1), observation.flatten(1)).view_as(a)

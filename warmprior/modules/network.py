@@ -16,10 +16,10 @@ from warmprior.modules.registry import Registered
 
 
 class VelocityNetwork(nn.Module, Registered):
-    """Base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
+    """The base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
 
-    :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any callable of the same
-    signature. This class adds shape checks and ``config()``, its name and its constructor's arguments.
+    :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any callable with the same
+    signature. This class adds shape checks, and ``config()`` with its name and constructor arguments.
 
     Args:
         action_dim: ``d_a``.
@@ -28,7 +28,7 @@ class VelocityNetwork(nn.Module, Registered):
         observation_steps: ``To``.
 
     Raises:
-        ValueError: if one of them is not positive.
+        ValueError: if a size is not positive.
 
     Examples:
         >>> import torch
@@ -51,7 +51,7 @@ class VelocityNetwork(nn.Module, Registered):
     """
 
     encodes: bool = False
-    """Whether :meth:`encode` does anything."""
+    """True if :meth:`encode` does anything."""
 
     def __init__(
         self, action_dim: int, observation_dim: int, prediction_length: int, observation_steps: int
@@ -69,7 +69,7 @@ class VelocityNetwork(nn.Module, Registered):
         self.observation_steps = observation_steps
 
     def check_chunk(self, a: Tensor) -> None:
-        """A ``ValueError`` if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""
+        """Raise ValueError if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""
         expected = (self.prediction_length, self.action_dim)
         if tuple(a.shape[1:]) != expected:
             raise ValueError(
@@ -78,7 +78,7 @@ class VelocityNetwork(nn.Module, Registered):
             )
 
     def check_shapes(self, a: Tensor, observation: Tensor | TensorDictBase) -> None:
-        """A ``ValueError`` for other chunks ``[B, P, d_a]`` or observations ``[B, To, d_o]`` than it has."""
+        """Raise ValueError unless chunks ``[B, P, d_a]`` and observations ``[B, To, d_o]`` fit."""
         self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
         built = f"{type(self).__name__} was built for observations [B, To, d_o] with (To, d_o) = {expected}"
@@ -89,14 +89,14 @@ class VelocityNetwork(nn.Module, Registered):
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """Encode an observation once, before the field is evaluated at it many times; by default nothing.
+        """Encode an observation once, before the field is evaluated many times; by default return it.
 
         The network takes the result in place of the observation, ``[B, To, d_o]`` or a tensordict ``[B]``.
         """
         return observation
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
-        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings."""
+        """Return optimiser groups: decay on matrix weights, none on biases, norms and embeddings."""
         decay: list[nn.Parameter] = []
         no_decay: list[nn.Parameter] = []
         for name, parameter in self.named_parameters():
@@ -108,27 +108,27 @@ class VelocityNetwork(nn.Module, Registered):
 def velocity_field(
     network: nn.Module, observation: Tensor | TensorDictBase
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A network's velocity ``(t [B], a [B, P, d_a]) -> v`` at observations, in the dtype of ``a``.
+    """Return a network's velocity ``(t [B], a [B, P, d_a]) -> v`` at observations, in the dtype of ``a``.
 
     The observations, ``[B, To, *]`` or a tensordict, are encoded once. The network computes in its own dtype;
     the path is integrated, and its error measured, in that of the actions.
     """
-    dtype, seen = _precision(network), encoded(network, observation)
+    dtype, encoding = _precision(network), encoded(network, observation)
     if dtype is None:
-        return lambda t, a: network(t, a, seen)
-    return lambda t, a: network(t.to(dtype), a.to(dtype), seen).to(a.dtype)
+        return lambda t, a: network(t, a, encoding)
+    return lambda t, a: network(t.to(dtype), a.to(dtype), encoding).to(a.dtype)
 
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype."""
+    """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
     dtype = _precision(network)
 
     def cast(value: Tensor) -> Tensor:
         return value if dtype is None or not value.is_floating_point() else value.to(dtype)
 
-    seen: Any = observation.apply(cast) if isinstance(observation, TensorDictBase) else cast(observation)
+    inputs: Any = observation.apply(cast) if isinstance(observation, TensorDictBase) else cast(observation)
     encode = getattr(network, "encode", None)
-    return seen if encode is None else encode(seen)
+    return inputs if encode is None else encode(inputs)
 
 
 def _precision(network: nn.Module) -> torch.dtype | None:
@@ -138,12 +138,12 @@ def _precision(network: nn.Module) -> torch.dtype | None:
 
 
 def device_of(network: nn.Module, data: Tensor | TensorDictBase) -> torch.device:
-    """Where a network's inputs have to be; where ``data`` are if it has no parameters."""
+    """Return the device of a network, or that of ``data`` if the network has no parameters."""
     return next((p.device for p in network.parameters()), data.device or torch.device("cpu"))
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
-    """An observation, ``[*B, To, *]`` or a tensordict ``[*B]``, with one batch dimension for ``*B``."""
+    """Flatten ``*B`` of an observation, ``[*B, To, *]`` or a tensordict ``[*B]``, to one dimension."""
     if len(batch) == 1:
         return observation
     if isinstance(observation, TensorDictBase):
@@ -152,12 +152,12 @@ def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size)
 
 
 class TimestepEmbedding(nn.Module):
-    """Sines and cosines of times ``[B]`` in [0, 1], ``[B, dim]``, at frequencies from 1 to ``last``.
+    """The sines and cosines ``[B, dim]`` of times ``[B]`` in [0, 1], at frequencies from 1 to ``last``.
 
-    They are log-spaced. The embedding of diffusion models, made for a thousand steps, does not suit flows: at
-    ``1000 t`` its fastest features are noise to the network, and ``t = 0``, the only time that a one-step
-    sampler evaluates, looks unlike every time seen in training. A ``ValueError`` if ``dim`` is odd or < 4, or
-    if ``last`` is not > 0.
+    The frequencies are log-spaced. The embedding of diffusion models, made for a thousand steps, does not
+    suit flows: at ``1000 t`` its fastest features are noise to the network, and ``t = 0``, the only time that
+    a one-step sampler evaluates, looks unlike every time in training. Raises ValueError if ``dim`` is odd or
+    < 4, or if ``last`` is not > 0.
     """
 
     frequencies: Tensor
@@ -179,10 +179,10 @@ _PREFIX = "_orig_mod."
 
 
 def uncompiled(module: nn.Module) -> nn.Module:
-    """The module inside a compiled one; any other is returned as it is."""
+    """Return the module inside a compiled one; any other is returned unchanged."""
     return getattr(module, _PREFIX[:-1], module)
 
 
 def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A state dict under the names of the uncompiled network."""
+    """Return a state dict with the names of the uncompiled network."""
     return {name.replace(_PREFIX, ""): value for name, value in tensors.items()}

@@ -15,7 +15,7 @@ from warmprior import keys
 
 
 class Normalizer(nn.Module):
-    """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).
+    """A map of every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).
 
     Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
     above 1) count as constant and are only shifted. The statistics are buffers.
@@ -50,7 +50,6 @@ class Normalizer(nn.Module):
                 )
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
-            # In the default dtype: normalised values then keep their own.
             first, last = (value[key].to(torch.get_default_dtype()) for value in (low, high))
             loc, half = (last + first) / 2, (last - first) / 2
             constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
@@ -70,12 +69,12 @@ class Normalizer(nn.Module):
         Args:
             data: flat steps ``[N]`` with raw ``[N, d]`` entries.
             keys: the entries to normalise.
-            units: per key the raw size ``[d]`` of 1, around the middle of the range; 0 for half the range.
-                Dimensions with such a unit may leave ``[-1, 1]``.
+            units: raw sizes ``[d]`` of one normalised unit, per key; 0 stands for half the range. Values
+                are still centred on the range, and may leave ``[-1, 1]``.
 
         Raises:
             KeyError: if a key is missing.
-            ValueError: if there is no step, or an entry is not finite.
+            ValueError: if there are no steps, or an entry is not finite.
         """
         if not len(data):
             raise ValueError("cannot fit a normaliser to an empty dataset")
@@ -98,19 +97,19 @@ class Normalizer(nn.Module):
 
     @property
     def positive(self) -> list[str]:
-        """Names of the buffers that are scales."""
+        """The names of the buffers that are scales."""
         return [_name(key, "scale") for key in self.keys]
 
     def loc(self, key: NestedKey) -> Tensor:
-        """Middle of the range of ``key``, ``[d]``, raw units."""
+        """Return the middle of the range of ``key``, ``[d]``, raw units."""
         return self.get_buffer(_name(key, "loc"))
 
     def scale(self, key: NestedKey) -> Tensor:
-        """Half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
+        """Return half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
         return self.get_buffer(_name(key, "scale"))
 
     def normalize(self, data: TensorDictBase) -> TensorDictBase:
-        """Raw to normalised, for the keys that are present; a shallow copy."""
+        """Return a shallow copy in which the keys that are present are normalised."""
         data = data.clone(False)
         for key in self.keys:
             value, loc = data.get(key, None), self.loc(key)
@@ -120,7 +119,7 @@ class Normalizer(nn.Module):
         return data
 
     def denormalize(self, data: TensorDictBase) -> TensorDictBase:
-        """Normalised to raw, for the keys that are present; a shallow copy."""
+        """Return a shallow copy in which the keys that are present are in raw units again."""
         data = data.clone(False)
         for key in self.keys:
             if data.get(key, None) is not None:
@@ -128,7 +127,7 @@ class Normalizer(nn.Module):
         return data
 
     def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
-        """TorchRL transforms that (de)normalise next to the base environment.
+        """Return TorchRL transforms that (de)normalise directly after the base environment.
 
         Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step.
         """
@@ -142,12 +141,12 @@ class Normalizer(nn.Module):
         return transforms
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable keys, each with its shape; the values themselves are buffers."""
+        """Return the keys and their shapes as JSON holds them; the values themselves are buffers."""
         return {"shapes": [[key, list(self.loc(key).shape)] for key in self.keys]}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Normalizer:
-        """An unfitted normaliser with the keys and shapes of :meth:`config`, to load buffers into."""
+        """Return an unfitted normaliser with the keys and shapes of :meth:`config`, to load buffers into."""
         zero: dict[NestedKey, Tensor] = {}
         for key, shape in config["shapes"]:
             zero[tuple(key) if isinstance(key, list) else key] = torch.zeros(shape)

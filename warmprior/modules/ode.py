@@ -19,16 +19,16 @@ from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
 JUMP = 0.5
-"""Where the dense steps of ``dense-jump`` end; Chen et al. saw fields pull towards training actions later."""
+"""The end of the dense steps of ``dense-jump``; Chen et al. saw fields pull to training actions after it."""
 
 
 def check_grid(grid: str) -> None:
-    """A ``ValueError`` if no grid has this name, or its jump does not start in (0, 1)."""
+    """Raise ValueError if no grid has this name, or its jump does not start in (0, 1)."""
     _jump(grid)
 
 
 def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[float, float, int]]:
-    """The parts of a grid as begin, end and number of steps; within each the steps are equally long.
+    """Return the parts of a grid as (begin, end, number of steps), each with steps of equal length.
 
     - ``"uniform"``: one part.
     - ``"dense-jump"``: all steps but one up to :math:`t_j`, and the last from there to ``t = 1`` (Dense-Jump
@@ -36,7 +36,7 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
       the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
       ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
 
-    One step is the same on every grid. A ``ValueError`` as of :func:`check_grid`.
+    A single step is the same on every grid. Raises ValueError as :func:`check_grid` does.
 
     Examples:
         >>> from warmprior.modules.ode import grid_parts
@@ -51,7 +51,7 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
 
 
 def _jump(grid: str) -> float | None:
-    """Share of the way before the jump; ``None`` without a jump."""
+    """Return the share of the way before the jump, or ``None`` without a jump."""
     if grid == "uniform":
         return None
     name, colon, number = str(grid).partition(":")
@@ -70,10 +70,10 @@ def _jump(grid: str) -> float | None:
 
 
 DEFAULT_NFE = 3
-"""Network evaluations per chunk by default; docs/which_source.md has the reasons."""
+"""The default number of network evaluations per chunk; docs/which_source.md has the reasons."""
 
 MAX_NFE = 10_000
-"""More would take minutes per chunk, and look like a process that hangs."""
+"""The largest ``nfe``: more would take minutes per chunk, and look like a process that hangs."""
 
 GUIDED_BY_WHOM = (
     ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
@@ -134,19 +134,19 @@ def integrate(
     r"""Solve :math:`\dot a_t = v(t, a_t)` from ``t=0`` to ``t=1``.
 
     Args:
-        velocity: ``(t [B], a_t [B, ...]) -> velocity [B, ...]``.
-        a0: source, ``[B, ...]``.
+        velocity: the field ``(t [B], a_t [B, ...]) -> [B, ...]``.
+        a0: the source sample, ``[B, ...]``.
         nfe: calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and Heun 2, RK4 4).
         solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
         grid: where the steps lie, see :func:`~warmprior.modules.ode.grid_parts`.
-        start_time: another time to start from, in [0, 1).
-        return_path: return every grid point instead of the last.
+        start_time: the time to start from, in [0, 1).
+        return_path: True returns every grid point instead of the last.
 
     Returns:
         ``a_1`` ``[B, ...]``, or the path ``[B, steps + 1, ...]`` from ``a_0`` to ``a_1``.
 
     Raises:
-        ValueError: for an option that is unknown or out of range.
+        ValueError: if an option is unknown or out of range.
 
     Examples:
         >>> import torch
@@ -176,22 +176,22 @@ def integrate(
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a policy draws a chunk: the noise of its source, and the integration of its flow.
+    """The options for drawing a chunk: the noise of the source, and the integration of the flow.
 
     Attributes:
         nfe: network evaluations per chunk; 3 by default, or ``max_nfe``.
-        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``.
+        max_nfe: the largest ``nfe`` that the training allows: 1 for a network trained at ``t = 0`` only.
         solver: see :func:`integrate`.
         grid: see :func:`integrate`.
-        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or one for each.
-            Set it to the range of the normalised data, such as 1: then the environment executes what the
-            prior remembers.
-        temperature: factor of the source's noise at decisions, ``a_0 = mu + temperature * sigma * eps``. By
+        clip: bound of the chunk, which is clamped to ``[-clip, clip]``; one for all action dimensions or one
+            for each. Set it to the range of the normalised data, such as 1, so that the environment executes
+            exactly the actions that the prior remembers.
+        temperature: factor on the source's noise at decisions, ``a_0 = mu + temperature * sigma * eps``. By
             default 1, and 0 under ``ExplorationType.DETERMINISTIC``, ``MEAN`` or ``MODE``: the flow then
             starts at the source's mean.
 
     Raises:
-        ValueError: for an option that is unknown, out of range or not what the network is trained for.
+        ValueError: if an option is unknown, out of range, or not supported by the network's training.
 
     Examples:
         >>> from warmprior import Sampling
@@ -223,7 +223,7 @@ class Sampling:
                 raise ValueError(f"temperature must be at least 0, got {self.temperature}")
 
     def evaluations(self, nfe: int | None = None) -> int:
-        """Return ``nfe`` or its default; a ``ValueError`` unless solver and network support that many."""
+        """Return ``nfe`` or its default; raise ValueError unless solver and network support that many."""
         nfe = self.nfe if nfe is None else nfe
         if nfe is None:
             nfe = DEFAULT_NFE if self.max_nfe is None else min(DEFAULT_NFE, self.max_nfe)
@@ -239,7 +239,7 @@ class Sampling:
         return nfe
 
     def clamped(self, chunk: Tensor) -> Tensor:
-        """Return a chunk ``[*B, P, d_a]`` within its bounds."""
+        """Return a chunk ``[*B, P, d_a]`` clamped to its bounds."""
         if isinstance(self.clip, Sequence):
             bound = torch.tensor(self.clip, dtype=chunk.dtype, device=chunk.device)
             return chunk.clamp(-bound, bound)
@@ -247,7 +247,7 @@ class Sampling:
 
 
 class ODEActor(TensorDictModuleBase):
-    """Transports the source to an action chunk: ``(noise, observation) -> chunk``.
+    """A module that integrates the source sample to an action chunk: ``(noise, observation) -> chunk``.
 
     Args:
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
@@ -257,12 +257,12 @@ class ODEActor(TensorDictModuleBase):
             history's ``"forecast"`` and ``"forecast_steps"``, and the delay.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         history_key: key of the history, which guidance reads.
-        source_key: where the source lies: ``(source_key, "noise")``, ``[*B, P, d_a]``.
+        source_key: parent key of the source sample, ``(source_key, "noise")``, ``[*B, P, d_a]``.
         chunk_key: where to write the chunk, ``[*B, P, d_a]``.
-        **sampling: options of :class:`Sampling`; per call: ``actor(data, nfe=3)``.
+        **sampling: options of :class:`Sampling`; ``nfe`` can also be set per call: ``actor(data, nfe=3)``.
 
     Raises:
-        ValueError: for an option that is unknown, out of range or not what the network is trained for.
+        ValueError: if an option is unknown, out of range, or not supported by the network's training.
         KeyError: if an input key is missing.
 
     Examples:
@@ -310,7 +310,7 @@ class ODEActor(TensorDictModuleBase):
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
-        """Write the chunk; ``sigma``, 1 by default, is the source's deviation for the guidance."""
+        """Write the chunk; ``sigma``, 1 by default, is the source's deviation, which guidance uses."""
         check_keys(tensordict, self.in_keys[:2], "ODEActor")
         check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
         a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)

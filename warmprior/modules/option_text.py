@@ -1,4 +1,4 @@
-"""What a user types for a registered class: its name, and options behind it."""
+"""Options as a user types them: the name of a registered class, followed by its arguments."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["build", "find", "make", "options_of"]
 
 
 def find[T: Registered](base: type[T], name: str) -> type[T]:
-    """Return the subclass of a name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
+    """Return a subclass by its name, or import it from a place such as ``"mypackage.priors:Anchor"``.
 
-    Importing runs code, so use this for names that a user typed, and never for names in a file. A
-    ``ValueError`` if there is none, or it is a base class.
+    Importing runs code, so use this for names that a user typed, and never for names in a file. Raises
+    ValueError if there is no such class, or it is a base class.
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -32,11 +32,11 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 
 
 def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
-    """Build what a user typed: a name as for :func:`find`, and options behind it, as in :func:`options_of`.
+    """Build an object from a name (:func:`find`) followed by options (:func:`options_of`).
 
-    ``args`` are further arguments of the constructor. A ``ValueError`` names what is wrong and what the
-    constructor takes. Of a text that may come from a file, look the name up by :func:`registered`, which
-    imports nothing, and pass its class to :func:`build`.
+    ``args`` are further arguments of the constructor. Raises ValueError, with what is wrong and what the
+    constructor takes. If the text may come from a file, look up its name with :func:`registered`, which
+    imports nothing, and pass the class to :func:`build`.
 
     Examples:
         >>> from warmprior.modules.option_text import make
@@ -48,7 +48,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
 
 
 def build[T: Registered](cls: type[T], text: str, *args: Any) -> T:
-    """Build an object of a class with the options behind a name; otherwise as :func:`make`."""
+    """Build an object of a class with the options that follow a name, as :func:`make` does."""
     options = options_of(text)
     try:
         return cls(*args, **options)
@@ -63,7 +63,7 @@ def build[T: Registered](cls: type[T], text: str, *args: Any) -> T:
 def options_of(text: str) -> dict[str, Any]:
     """Return the options of ``name,option=value,...``, as JSON or plain text.
 
-    A comma separates options if ``option=`` follows, and belongs to the value otherwise. A ``ValueError``
+    A comma separates options if ``option=`` follows, and belongs to the value otherwise. Raises ValueError
     if the text has another form.
     """
     options: dict[str, Any] = {}

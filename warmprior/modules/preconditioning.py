@@ -19,15 +19,15 @@ from warmprior.modules.registry import from_config
 from warmprior.modules.trend import VARIANCE_FLOOR, PoseTrend
 
 CORRELATION_LIMIT = 1 - 1e-6
-"""Above this correlation source and target determine each other."""
+"""The largest correlation; above it source and target determine each other."""
 
 
 class SourceMoments(nn.Module):
-    """Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
+    """The means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
 
-    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are at
-    least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
-    dimensions, positions that are always padded and deterministic sources stay harmless.
+    There is one set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances
+    are at least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
+    dimensions, positions that are always padded and deterministic sources cause no division by zero.
 
     Args:
         source_mean: :math:`m_0`.
@@ -69,11 +69,11 @@ class SourceMoments(nn.Module):
         covariance: Tensor,
     ) -> None:
         super().__init__()
-        given = (source_mean, target_mean, source_variance, target_variance, covariance)
-        shapes = [tuple(value.shape) for value in given]
+        moments = (source_mean, target_mean, source_variance, target_variance, covariance)
+        shapes = [tuple(value.shape) for value in moments]
         if len(set(shapes)) > 1 or source_mean.ndim != 2:
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
-        if not all(bool(torch.isfinite(value).all()) for value in given):
+        if not all(bool(torch.isfinite(value).all()) for value in moments):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
         v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance))
         limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
@@ -84,19 +84,18 @@ class SourceMoments(nn.Module):
             "source_variance": v0,
             "target_variance": v1,
             "covariance": c,
-            # Of the target given the source. Computed here, because lower precisions would lose the
-            # difference.
+            # The target's deviation given the source, in float64: lower precisions would lose the difference.
             "conditional_deviation": (v1 - c.square() / v0).sqrt(),
         }.items():
             # Copies, so that a tensor given twice does not become one buffer under two names.
             self.register_buffer(name, value.to(source_mean.dtype, copy=True))
 
     def config(self) -> None:
-        """Nothing: the values are buffers, and take the place of the :meth:`identity`."""
+        """Return nothing: the values are buffers, and replace those of :meth:`identity`."""
 
     @classmethod
     def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
-        """Moments of independent standard normal ends, to be replaced by loading a state dict."""
+        """Return moments of independent standard normal ends, to be replaced by loading a state dict."""
         zero, one = (f(prediction_length, action_dim) for f in (torch.zeros, torch.ones))
         return cls(zero, zero, one, one, zero)
 
@@ -112,10 +111,10 @@ class SourceMoments(nn.Module):
         trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
-        """Estimate them, as float32, from unpadded positions of training windows and draws of the prior.
+        """Estimate moments, as float32, from unpadded positions of training windows and draws of the prior.
 
-        A position that is padded in all windows gets those of independent standard normal ends; no loss reads
-        it.
+        A position that is padded in all windows gets the moments of independent standard normal ends; no loss
+        reads it.
 
         Args:
             windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``, used once each.
@@ -123,10 +122,10 @@ class SourceMoments(nn.Module):
             coupling: how the training pairs sources and targets, see :data:`~warmprior.Coupling`.
             samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
-            generator: source of randomness of the source samples, on the windows' device.
+            generator: draws the source samples, on the windows' device.
 
         Raises:
-            ValueError: if there are fewer than two windows, or they are of other lengths.
+            ValueError: if there are fewer than two windows, or their lengths do not fit the prior.
         """
         if isinstance(windows, TensorDictBase):
             batches = [windows]
@@ -164,8 +163,8 @@ class SourceMoments(nn.Module):
         m0, m1 = mean(a0), mean(a1)
         v0, v1 = mean((a0 - m0).square()), mean((a1 - m1).square())
         c = mean((a0 - m0) * (a1 - m1))
-        seen = (count > 0).expand_as(m0)
-        v0, v1 = (torch.where(seen, value, 1.0) for value in (v0, v1))
+        unpadded = (count > 0).expand_as(m0)
+        v0, v1 = (torch.where(unpadded, value, 1.0) for value in (v0, v1))
         return cls(*(value.float() for value in (m0, m1, v0, v1, c)))
 
 
@@ -180,26 +179,26 @@ class PreconditionedNetwork(VelocityNetwork):
         + \sqrt{Var(u_t) - \frac{Cov(u_t, a_t)^2}{Var(a_t)}} \;
         F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
 
-    The first two terms predict the velocity linearly from the point, and input and target of :math:`F` have
-    mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal where :math:`(a_0,
+    The first two terms predict the velocity linearly from :math:`a_t`; the input and the target of :math:`F`
+    have mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal if :math:`(a_0,
     a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
     Eq. 7), whose constants assume zero means and an independent source.
 
     Variance and scale are computed without differences, with :math:`s_0 = \sqrt{v_0}` and the deviation
-    :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`
-    and :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
+    :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`,
+    and the scale of :math:`F` is :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
-        network: :math:`F`; or its ``config()``, as for the next.
-        moments: of the prior's source and the targets; by default those of independent standard normal ends,
-            to be replaced by loading a state dict.
-        trend: trend of the gripper poses, which gives :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place of
-            the means above; the moments are then those of the remainder.
-        interpolant: the path of the loss; linear by default.
+        network: the network :math:`F`, or its ``config()``.
+        moments: the moments of the prior's source and the targets; by default those of independent standard
+            normal ends, to be replaced by loading a state dict.
+        trend: the trend of the resting action, or its ``config()``. It gives :math:`E[a_0 | o]` and
+            :math:`E[a_1 | o]` in place of the means above; the moments are then those of the remainder.
+        interpolant: the path of the loss, or its ``config()``; linear by default.
 
     Raises:
-        ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
-            velocity at its ends.
+        ValueError: if the shapes of the moments or the trend differ from the network's, or the path has no
+            finite velocity at its ends.
 
     See Also:
         :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
@@ -241,31 +240,31 @@ class PreconditionedNetwork(VelocityNetwork):
         shape = (network.prediction_length, network.action_dim)
         self.moments = SourceMoments.identity(*shape) if moments is None else moments
         self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
-        given = {"moments are": self.moments.covariance}
+        parts = {"moments are": self.moments.covariance}
         if self.trend is not None:
-            given["trend is"] = self.trend.target
-        for name, value in given.items():
+            parts["trend is"] = self.trend.target
+        for name, value in parts.items():
             if tuple(value.shape) != shape:
                 raise ValueError(
-                    f"the {name} of chunks (P, d_a) = {tuple(value.shape)}, but the network was built for "
+                    f"the {name} for chunks (P, d_a) = {tuple(value.shape)}, but the network was built for "
                     f"{shape}"
                 )
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """As the network inside does."""
+        """Encode an observation with the network inside."""
         return self.network.encode(observation) if self.encodes else observation
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
-        """The groups of the network inside."""
+        """Return the parameter groups of the network inside."""
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """The unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
+        """Return the unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
         coefficients = self.interpolant.coefficients(t[:, None, None])
         return self._remainder(*coefficients) * self._scale(*coefficients[:2])
 
     def _scale(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """One over the standard deviation of the point."""
+        """Return one over the standard deviation of the point."""
         moments = self.moments
         s0 = moments.source_variance.sqrt()
         # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
@@ -274,12 +273,12 @@ class PreconditionedNetwork(VelocityNetwork):
         return torch.addcmul(along * along, across, across).rsqrt()
 
     def _remainder(self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor) -> Tensor:
-        """The remainder times the standard deviation of the point."""
+        """Return the remainder times the standard deviation of the point."""
         s0 = self.moments.source_variance.sqrt()
         return (alpha * d_beta - d_alpha * beta).abs() * (s0 * self.moments.conditional_deviation)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
         moments = self.moments

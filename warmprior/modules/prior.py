@@ -17,7 +17,7 @@ from warmprior.modules.registry import Registered
 
 
 def noise_factor(temperature: float | None) -> float:
-    """Return the temperature of a decision: by default 1, and 0 where TorchRL explores deterministically."""
+    """Return a decision's temperature: by default 1, or 0 while TorchRL explores deterministically."""
     if temperature is not None:
         return temperature
     return 1.0 if exploration_type() in (None, ExplorationType.RANDOM) else 0.0
@@ -30,8 +30,8 @@ class Source:
     Attributes:
         loc: :math:`\mu`, ``[*B, P, d_a]``, normalised action space.
         scale: :math:`s`, broadcastable to ``loc``.
-        warm: where the history decides the mean, bool ``[*B, P, 1]``.
-        correlation: share of the noise's variance that all warm positions of a dimension have in common.
+        warm: True at positions whose mean comes from the history, bool ``[*B, P, 1]``.
+        correlation: share of the noise's variance that is common to all warm positions of a dimension.
 
     Examples:
         >>> import torch
@@ -49,7 +49,7 @@ class Source:
     def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> Tensor:
         """Draw ``a_0 = loc + temperature * scale * eps``, ``[*B, P, d_a]``.
 
-        By default PyTorch's global generator draws.
+        PyTorch's global generator is the default.
         """
         loc = self.loc
         like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device}
@@ -74,18 +74,18 @@ class Prior(Registered):
         a_0[\tau] = \mu_\tau + \sigma \varepsilon_\tau \;\; (\tau \in W), \qquad
         a_0[\tau] = \varepsilon_\tau \;\; (\tau \in C), \qquad \varepsilon \sim N(0, I).
 
-    The mean is a function of the history (:mod:`warmprior.history`), which training and deployment write
-    alike. Override :meth:`distribution` for another source, such as a learned one: a subclass that is an
-    ``nn.Module`` as well (call ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
+    The mean is a function of the history (:mod:`warmprior.history`), which has the same layout in training
+    and deployment. Override :meth:`distribution` for another source, such as a learned one: a subclass that
+    is also an ``nn.Module`` (call ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
         sigma: standard deviation around the mean, in normalised action units; 0 is the deterministic limit.
-        correlation: share of the noise's variance that all warm positions of a dimension have in common, in
-            [0, 1]. 0 is the paper's white noise, through which a network sees by averaging over the chunk.
+        correlation: share of the noise's variance that is common to all warm positions of a dimension, in
+            [0, 1]. 0 is the paper's white noise, which a network can remove by averaging over the chunk.
 
     Raises:
-        ValueError: for a number out of its range.
+        ValueError: if a number is out of range.
 
     Examples:
         >>> import torch
@@ -102,9 +102,9 @@ class Prior(Registered):
     """
 
     prediction_chunks: int = 1
-    """Predicted actions ``P`` per executed ones ``H``."""
+    """The ratio ``P / H`` of predicted to executed actions."""
     default_sigma: ClassVar[float] = 1.0
-    """``sigma`` where none is given."""
+    """The ``sigma`` used if none is given."""
 
     def __init__(self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0) -> None:
         check_whole_numbers(chunk_length=chunk_length)
@@ -119,31 +119,32 @@ class Prior(Registered):
 
     @property
     def prediction_length(self) -> int:
-        """``P``, the number of actions that the network predicts."""
+        """The number ``P`` of actions that the network predicts."""
         return self.chunk_length * self.prediction_chunks
 
     @property
     def history_length(self) -> int:
-        """How many executed actions :meth:`mean` needs, at least ``H``."""
+        """The number of executed actions that :meth:`mean` needs, at least ``H``."""
         return self.chunk_length
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Of histories ``[*B]`` the mean, ``loc`` ``[*B, P, d_a]``, and ``warm``, bool ``[*B, P, 1]``.
+        """Return the mean ``loc`` ``[*B, P, d_a]`` and the mask ``warm``, bool ``[*B, P, 1]``.
 
-        ``loc`` is ignored on cold positions. Training knows only the first ``P - H`` steps of the forecast.
+        They are for histories ``[*B]``. ``loc`` is ignored where ``warm`` is False. In training, only the
+        first ``P - H`` steps of the forecast are known.
         """
         raise NotImplementedError(f"{type(self).__name__} needs a method mean(history)")
 
     def distribution(
         self, history: TensorDictBase, observation: Tensor | TensorDictBase | None = None
     ) -> Source:
-        """Return the source of histories ``[*B]`` (Eq. 1).
+        """Return the source for histories ``[*B]`` (Eq. 1).
 
-        The paper's sources ignore the observation, what the network sees, ``[*B, To, d_o]``.
+        The observation is the network's input, ``[*B, To, d_o]``; the paper's sources ignore it.
 
         Raises:
             KeyError: if an entry of the history is missing.
-            ValueError: if the history has other lengths than the prior, or :meth:`mean` returns wrong shapes.
+            ValueError: if the history's lengths differ from the prior's, or a shape of :meth:`mean` is wrong.
         """
         loc, warm = checked_mean(self, history)
         scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a plain number has no dtype
@@ -155,12 +156,12 @@ class Prior(Registered):
         observation: Tensor | TensorDictBase | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Draw the source ``a_0`` from :meth:`distribution`, ``[*B, P, d_a]``."""
+        """Draw a source sample ``a_0``, ``[*B, P, d_a]``, from :meth:`distribution`."""
         return self.distribution(history, observation).sample(generator)
 
 
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """The checked result of :meth:`Prior.mean`, in the history's dtype."""
+    """Check the result of :meth:`Prior.mean`, and return it in the history's dtype."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
     mean, forecast = prior.mean(history), history.get("forecast")
     name = f"{type(prior).__name__}.mean"
@@ -173,7 +174,7 @@ def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]
 
 
 class GaussianPrior(Prior):
-    """The usual standard normal source: nothing is ever warm.
+    """The usual standard normal source; no position is ever warm.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -191,7 +192,7 @@ class GaussianPrior(Prior):
         super().__init__(chunk_length)
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """All cold."""
+        """Return zeros; every position is cold."""
         loc = torch.zeros_like(history["forecast"])
         return loc, torch.zeros_like(loc[..., :1], dtype=torch.bool)
 
@@ -199,7 +200,7 @@ class GaussianPrior(Prior):
 class PastPrior(Prior):
     """WP-Past: the mean is the last ``H`` executed actions (Eq. 2).
 
-    Nothing is warm before ``H`` actions of the episode were executed.
+    No position is warm until ``H`` actions of the episode have been executed.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -224,7 +225,7 @@ class PastPrior(Prior):
     default_sigma = 0.5
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The last ``H`` executed actions, if there are that many."""
+        """Return the last ``H`` executed actions; they are warm if there are that many."""
         warm = (history["steps"] >= self.chunk_length).unsqueeze(-1)
         loc = history["actions"][..., -self.chunk_length :, :]
         return loc, warm.expand(*loc.shape[:-1], 1)
@@ -233,9 +234,9 @@ class PastPrior(Prior):
 class PreviewPrior(Prior):
     """WP-Preview: the mean is the policy's own earlier forecast of this chunk.
 
-    The network predicts ``P = 2H`` actions. In training the target's own first ``H`` are the forecast (Eq.
-    3); at decisions it is the previous prediction's ``[k, k+H)`` (Eq. 4). The second half is always cold.
-    Algorithm 1 never shows the network a cold first half, which begins every episode;
+    The network predicts ``P = 2H`` actions. In training the forecast is the target's own first ``H`` actions
+    (Eq. 3); at decisions it is positions ``[k, k+H)`` of the previous prediction (Eq. 4). The second half is
+    always cold. Every episode starts with a cold first half, which Algorithm 1 never shows the network;
     :class:`~warmprior.WithheldHistory` does, which matters for small ``sigma``.
 
     Args:
@@ -258,7 +259,7 @@ class PreviewPrior(Prior):
     prediction_chunks = 2
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The first ``H`` steps of the forecast, if it reaches that far."""
+        """Return the forecast; its first ``H`` steps are warm if it reaches that far."""
         forecast, steps = history["forecast"], history["forecast_steps"]
         position = torch.arange(self.prediction_length, device=steps.device)
         warm = (steps >= self.chunk_length) & (position < self.chunk_length)

@@ -1,4 +1,4 @@
-"""Real-Time Chunking: guides a flow towards the rest of the chunk being executed."""
+"""Real-Time Chunking: guidance of a flow towards the rest of the chunk being executed."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
     "ones": torch.ones_like,
     "zeros": lambda linear: (linear >= 1).to(linear),
 }
-"""How the weight of a position falls behind the delay, by name, as a function of a linear fall."""
+"""Schedules of the weight after the delay, by name; each is a function of a weight that falls linearly."""
 
 Schedule = Literal["exp", "linear", "ones", "zeros"]
 
 
 def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
-    """A late chunk ``[*B, P, d_a]`` as it is executed: the first ``delay``, ``[*B, 1]``, from the leftover.
+    """Return a late chunk ``[*B, P, d_a]`` as it is executed: its first ``delay`` actions from the leftover.
 
-    The leftover is what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
+    The leftover is the previous chunk at the same control steps, ``[*B, P, d_a]``; the delay is ``[*B, 1]``.
     """
     late = torch.arange(chunk.shape[-2], device=chunk.device) < delay
     return torch.where(late.unsqueeze(-1), leftover.to(chunk.dtype), chunk)
@@ -36,7 +36,7 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RealTimeChunking:
-    r"""Guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
+    r"""The guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
 
     While a chunk is computed, the old one is executed for ``d`` more control steps (the delay), and the new
     one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old chunk, with
@@ -49,25 +49,25 @@ class RealTimeChunking:
     :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation :math:`S`
     (docs/real_time_chunking.md derives it). :math:`\sigma = S = 1` is the published weight,
     :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
-    (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the positions before the delay, which are
-    executed as they are in the old chunk, falls behind it by ``schedule``, and is 0 from ``horizon`` on.
+    (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the first ``d`` positions, at which the old
+    chunk is executed, then falls as ``schedule`` says, and is 0 from ``horizon`` on.
 
     Args:
         horizon: first position without guidance (LeRobot's execution_horizon, the official code's
             prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
         schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
-        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and 0.6
-            of the time, but is no longer exact in the Gaussian case.
-        sigma: the source's standard deviation in the weight; its own by default. 1 gives the published
-            weight.
+        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and
+            takes 0.6 of the time, but is no longer exact in the Gaussian case.
+        sigma: the source's standard deviation in the weight; by default that of the policy's source. 1 gives
+            the published weight.
         data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
             POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
-        trust_region: bound of the correction perpendicular to the velocity, as a share of the velocity's
+        trust_region: bound on the correction perpendicular to the velocity, as a share of the velocity's
             norm; None for no bound. POTR bounds that part too; this form is ours.
 
     Raises:
-        ValueError: for an unknown schedule, or a number that is not positive.
+        ValueError: if the schedule is unknown, or a number is out of range.
 
     Examples:
         >>> import torch
@@ -103,24 +103,24 @@ class RealTimeChunking:
                 raise ValueError(f"{name} must be {least}, got {value}")
 
     def config(self) -> dict[str, Any]:
-        """The options, as JSON holds them."""
+        """Return the options as JSON holds them."""
         return asdict(self)
 
     def check_reach(self, delay: int, left: int) -> None:
-        """A ``ValueError`` if the delay exceeds the horizon, or what is left of the old chunk."""
+        """Raise ValueError if the delay exceeds the horizon, or the rest of the old chunk."""
         if not 0 <= delay <= left:
             raise ValueError(
-                f"a delay of {delay} control steps needs as many actions of the old chunk, and {left} are "
-                "left of it: execute fewer actions per decision, or predict longer chunks"
+                f"a delay of {delay} control steps needs as many actions of the old chunk, but only {left} "
+                "are left: execute fewer actions per decision, or predict longer chunks"
             )
         if self.horizon is not None and self.horizon < delay:
             raise ValueError(
                 f"the guidance ends at horizon={self.horizon}, before the delay of {delay} control steps "
-                f"does: need horizon >= delay, or None for all {left} actions that are left"
+                f"ends: set horizon >= delay, or None for all {left} actions that are left"
             )
 
     def weights(self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None) -> Tensor:
-        """:math:`W` by position, ``[*B, P]``, for a ``delay`` and positions ``left``, each int64 ``[*B]``."""
+        """Return the weights :math:`W` ``[*B, P]`` for a delay and ``left`` positions, int64 ``[*B]``."""
         i = torch.arange(length, device=delay.device)
         end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
         start = torch.minimum(delay.unsqueeze(-1), end)
@@ -128,7 +128,7 @@ class RealTimeChunking:
         return torch.where(i < end, SCHEDULES[self.schedule](linear), 0.0)
 
     def guidance_weight(self, t: Tensor, sigma: Tensor | float = 1.0) -> Tensor:
-        r""":math:`\min(g(t), \beta)` at times in [0, 1]; the source's deviation broadcasts to them."""
+        r"""Return :math:`\min(g(t), \beta)` at times in [0, 1]; the source's deviation broadcasts to them."""
         if self.sigma is not None:
             sigma = self.sigma
         tiny = torch.finfo(t.dtype).tiny
@@ -139,19 +139,19 @@ class RealTimeChunking:
     def guided(
         self, velocity: Velocity, leftover: Tensor, left: Tensor, delay: Tensor, sigma: Tensor | float = 1.0
     ) -> Velocity:
-        """A velocity that makes chunks continue the leftover; ``velocity`` itself if no row has one.
+        """Return a velocity that makes chunks continue the leftover, or ``velocity`` if no row has one.
 
         It works under ``torch.no_grad()``, and its result is detached.
 
         Args:
-            velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
+            velocity: the field ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
             leftover: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
-            left: how many of its first positions count, int64 ``[B, 1]``. Rows with 0 are not guided.
+            left: number of its first positions that count, int64 ``[B, 1]``. Rows with 0 are not guided.
             delay: ``d``, int64 ``[B, 1]``.
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
 
         Raises:
-            ValueError: if the shapes do not fit, or see :meth:`check_reach`.
+            ValueError: if the shapes do not fit, or the delay is too long (:meth:`check_reach`).
             RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
         """
         rows, length = leftover.shape[:2]
@@ -191,7 +191,7 @@ class RealTimeChunking:
         return corrected
 
     def _within(self, correction: Tensor, velocity: Tensor) -> Tensor:
-        """The correction, inside the trust region around the velocity's direction."""
+        """Return the correction, limited to the trust region around the velocity's direction."""
         if self.trust_region is None:
             return correction
         c, v = correction.flatten(1), velocity.flatten(1)

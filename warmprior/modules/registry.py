@@ -1,4 +1,4 @@
-"""Classes that configurations name, and the arguments that their objects were built from."""
+"""Classes that can be built from a configuration: a name and constructor arguments."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["Registered", "from_config"]
 
 
 class Registered:
-    """Base class of what a saved policy names: a class by its name, and the arguments of its constructor.
+    """The base class of objects that a saved policy stores as a class name and constructor arguments.
 
     An object keeps every argument of its constructor in an attribute of the same name, as estimators of
     scikit-learn do; ``config()`` reads them there. Arguments that pass through ``**options`` are those of the
-    next constructor. Every direct subclass has a registry of its own subclasses, except for those declared
+    next constructor. Every direct subclass has a registry of its own subclasses, except those declared
     ``abstract=True``.
 
     Raises:
-        ValueError: when a subclass takes the name of another, or a name that no file can have.
+        ValueError: if a subclass takes the name of another, or a name that no file can have.
 
     Examples:
         >>> from warmprior.modules.registry import Registered, from_config
@@ -33,7 +33,7 @@ class Registered:
     """
 
     name: ClassVar[str]
-    """In options and files; that of the class by default."""
+    """The name in options and files; by default that of the class."""
     classes: ClassVar[dict[str, type[Any]]]
     """The subclasses that can be built, by name."""
 
@@ -54,9 +54,9 @@ class Registered:
             cls.classes[name] = cls
 
     def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments, from the attributes of their names.
+        """Return the constructor's arguments, read from the attributes of the same names.
 
-        A ``TypeError`` names an argument that the object does not keep.
+        Raises TypeError if the object does not keep an argument.
         """
         values: dict[str, Any] = {}
         for cls in type(self).__mro__:
@@ -78,7 +78,7 @@ class Registered:
     def config(self) -> dict[str, Any]:
         """Return name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
-        An argument that has a ``config()`` is saved as that. A ``TypeError`` if JSON cannot hold one.
+        An argument with a ``config()`` is saved as that. Raises TypeError if JSON cannot hold an argument.
         """
         values = {n: v.config() if hasattr(v, "config") else v for n, v in self.arguments().items()}
         try:
@@ -98,20 +98,20 @@ class Registered:
 
 
 def _keeps(part: object, name: str) -> bool:
-    """Whether an object has an attribute of its own of this name, or a property."""
-    default = getattr(type(part), name, part)  # of the class, which says nothing of the object
+    """Return True if an object itself has an attribute of this name, or a property."""
+    default = getattr(type(part), name, part)
     return hasattr(part, name) and (name in vars(part) or default is part or isinstance(default, property))
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
-    """Build what :meth:`Registered.config` describes, without importing anything; an unknown name raises."""
+    """Build the object that :meth:`Registered.config` describes, without importing anything."""
     arguments = dict(config)
     name = arguments.pop("name", None)
     return registered(base, name, "import the module that defines it")(**arguments)
 
 
 def registered[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
-    """Return the subclass of a name; a ``ValueError`` lists those that exist, and advises."""
+    """Return the subclass with a name; raise ValueError with the existing names and advice."""
     if name not in base.classes:
         raise ValueError(
             f"unknown {kind(base)} {name!r}: it is none of {', '.join(sorted(base.classes))}; {advice}"

@@ -19,9 +19,9 @@ def _check_sizes(num_heads: int, embedding_dim: int, num_layers: int, observatio
 
 
 class ChiTransformer(VelocityNetwork):
-    """Decoder transformer over action tokens that attends to time and observation tokens.
+    """A decoder transformer over action tokens that attends to time and observation tokens.
 
-    The architecture of `Diffusion Policy <https://arxiv.org/abs/2303.04137>`_ (Chi et al., 2023) in the
+    It is the architecture of `Diffusion Policy <https://arxiv.org/abs/2303.04137>`_ (Chi et al., 2023) in the
     paper's sizes (Table 3). Action tokens attend causally to each other and to the memory ``[time, o_{-To+1},
     ..., o_0]``.
 
@@ -40,10 +40,10 @@ class ChiTransformer(VelocityNetwork):
         num_layers: decoder layers.
         num_heads: attention heads, a divisor of ``embedding_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
-        dropout: in attention and feed-forward layers.
+        dropout: dropout rate of attention and feed-forward layers.
         observation_layers: hidden layers of a network that makes the observation tokens from all ``To`` steps
-            together; without any, each token is a linear function of its own step.
-        time_frequency: the time embedding has frequencies from 1 to this one.
+            together; with 0, each token is a linear function of its own step.
+        time_frequency: the highest frequency of the time embedding; the lowest is 1.
 
     Raises:
         ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
@@ -126,7 +126,7 @@ class ChiTransformer(VelocityNetwork):
             nn.init.zeros_(module.in_proj_bias)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         memory = torch.cat([self.embed_time(t)[:, None], self.embed_observation(observation)], dim=1)
         memory = self.encoder(memory + self.memory_position)
@@ -136,7 +136,7 @@ class ChiTransformer(VelocityNetwork):
 
 
 class _AdaLNBlock(nn.Module):
-    """Self-attention and a feed-forward layer, each scaled, shifted and gated by a condition."""
+    """A block of self-attention and a feed-forward layer, each scaled, shifted and gated by a condition."""
 
     def __init__(self, dim: int, num_heads: int) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class _AdaLNBlock(nn.Module):
 
 
 class AdaLNTransformer(VelocityNetwork):
-    """Transformer over action tokens that time and observation modulate (DiT, Peebles and Xie, 2023).
+    """A transformer over action tokens, modulated by time and observation (DiT, Peebles and Xie, 2023).
 
     Time and observations become one vector. It scales, shifts and gates every layer (adaptive layer norm,
     from no effect at first), in place of the cross-attention of :class:`ChiTransformer`.
@@ -178,7 +178,7 @@ class AdaLNTransformer(VelocityNetwork):
         num_heads: attention heads, a divisor of ``embedding_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
         observation_layers: hidden layers of the network that reads all ``To`` steps together.
-        time_frequency: the time embedding has frequencies from 1 to this one.
+        time_frequency: the highest frequency of the time embedding; the lowest is 1.
 
     Raises:
         ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
@@ -224,7 +224,7 @@ class AdaLNTransformer(VelocityNetwork):
         self.head = nn.Sequential(nn.LayerNorm(embedding_dim), nn.Linear(embedding_dim, action_dim))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         condition = F.silu(self.embed_time(t) + self.embed_observation(observation.flatten(1)))
         tokens = self.embed_action(a) + self.action_position

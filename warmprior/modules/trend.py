@@ -1,4 +1,4 @@
-"""The part of absolute actions that follows from where a robot is."""
+"""The part of absolute actions that follows from the robot's current position."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from warmprior.modules.registry import Registered, from_config
 from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
 
 DRAWS = 16
-"""The source is drawn so often per window that the mean has little noise, which belongs to no observation."""
+"""The number of source samples per window, so many that little noise is left in their mean."""
 
 VARIANCE_FLOOR = 1e-4
-"""A standard deviation of 0.01, half a percent of the normalised range; smaller ones count as constant."""
+"""0.01 squared: dimensions that deviate by less than half a percent of their range count as constant."""
 
 _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
 
@@ -27,15 +27,15 @@ _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, 
 class RestingAction(Registered, nn.Module):
     """The absolute action that asks a robot to stay where the observation says it is.
 
-    Subclasses say which numbers of the observation are the position of what: :class:`RestingJoints` and
-    :class:`RestingPose`. Called with normalised observations ``[*B, d_o]`` they return normalised actions
-    ``[*B, d_a]``, 0 where an action is no target.
+    The subclasses :class:`RestingJoints` and :class:`RestingPose` find the robot's position in the
+    observation. Called with normalised observations ``[*B, d_o]`` they return normalised actions
+    ``[*B, d_a]``, 0 where an action is not a position target.
 
     Args:
-        columns: which numbers of the observation.
-        action_shape: of the actions, ``d_a`` in all.
-        normalizer: of the observations ``[d_o]`` and the actions ``[d_a]``; an identity by default, to be
-            replaced by loading a state dict.
+        columns: indices of the position in the observation.
+        action_shape: shape of an action before it is flattened to ``d_a`` numbers.
+        normalizer: normaliser of the observations ``[d_o]`` and the actions ``[d_a]``; an identity by
+            default, to be replaced by loading a state dict.
 
     Examples:
         >>> import torch
@@ -67,7 +67,7 @@ class RestingAction(Registered, nn.Module):
 
     @property
     def width(self) -> int:
-        """``d_a``."""
+        """The number ``d_a`` of actions."""
         return self.action_loc.numel()
 
     def config(self) -> dict[str, Any]:
@@ -79,9 +79,9 @@ class RestingPose(RestingAction):
     """The absolute pose at which every gripper stays where the observation says it is.
 
     Args:
-        columns: ``[arms, 7]``, where in the observation each gripper's position and the
-            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
-        normalizer: see :class:`RestingAction`; of actions ``[10 * arms]``, the grippers' 0.
+        columns: ``[arms, 7]``, the indices in the observation of each gripper's position and the
+            ``(x, y, z, w)`` quaternion of its hand, as robomimic's files have them.
+        normalizer: see :class:`RestingAction`; the actions are ``[10 * arms]``, with 0 for the grippers.
 
     Examples:
         >>> import torch
@@ -101,7 +101,7 @@ class RestingPose(RestingAction):
         super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The action ``[*B, 10 * arms]``."""
+        """Return the resting action ``[*B, 10 * arms]``."""
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
         site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
@@ -114,8 +114,8 @@ class RestingJoints(RestingAction):
     """The joint targets at which every joint stays where the observation says it is.
 
     Args:
-        columns: ``[d_a]``, where in the observation the position is that an action is the target of, in
-            the same units; -1 for an action that is no target.
+        columns: ``[d_a]``, for every action the index in the observation of the position that it sets, in
+            the same units; -1 for an action that sets no position.
         normalizer: see :class:`RestingAction`.
 
     Examples:
@@ -135,7 +135,7 @@ class RestingJoints(RestingAction):
         super().__init__(columns, (len(columns),), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The action ``[*B, d_a]``."""
+        """Return the resting action ``[*B, d_a]``."""
         joints = observation[..., self.columns] * self.scale + self.loc
         return torch.where(self.columns >= 0, (joints - self.action_loc) / self.action_scale, 0.0)
 
@@ -190,7 +190,7 @@ class PoseTrend(nn.Module):
 
     @classmethod
     def zero(cls, rest: dict[str, Any], prediction_length: int) -> PoseTrend:
-        """No trend, to be replaced by loading a state dict."""
+        """Return a trend of zeros, to be replaced by loading a state dict."""
         made = from_config(RestingAction, rest)
         none = torch.zeros(prediction_length, made.width)
         return cls(made, none[0], none, none)
@@ -205,10 +205,10 @@ class PoseTrend(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ) -> PoseTrend:
-        """Estimate it, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
+        """Estimate a trend, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
 
         The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
-        is of the source samples, on the windows' device.
+        draws the source samples, on the windows' device.
         """
         resting = rest(_vector(windows[keys.OBSERVATION])[:, -1].float()).double()
         centre = resting.mean(0)
@@ -224,18 +224,19 @@ class PoseTrend(nn.Module):
         return cls(rest, centre.float(), *slopes.float())
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable arguments of :meth:`zero`; the values themselves are buffers."""
+        """Return the arguments of :meth:`zero` as JSON holds them; the values themselves are buffers."""
         return {"rest": self.rest.config(), "prediction_length": len(self.source)}
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
+        """Return the predicted deviations of source and target from their means, each ``[B, P, d_a]``.
 
-        Of normalised observations ``[B, To, d_o]`` the last step counts; of images and a state, the state.
+        They depend on the last step of normalised observations ``[B, To, d_o]``, or of the ``"state"`` in
+        observations with images.
         """
         deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).unsqueeze(1)
         return deviation * self.source, deviation * self.target
 
 
 def _vector(observation: Tensor | TensorDictBase) -> Tensor:
-    """The observation, or the robot's state beside images; an encoder's features begin with it."""
+    """Return the observation, or its state if it has images; an encoder's features begin with the state."""
     return observation[keys.STATE] if isinstance(observation, TensorDictBase) else observation

@@ -16,16 +16,16 @@ from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
-"""Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
+"""A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
 
-The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. A coupling may
-have ``config()``, what it depends on, so that a training knows whether it may be continued, and an
-``interpolant`` and ``times``, a path and training times of its own, which the loss takes.
+The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
+may have a ``config()``, which a training compares before it is continued, and an ``interpolant`` and
+``times``, a path and training times that the loss uses instead of its own.
 """
 
 
 class OTCoupling:
-    r"""OT-CFM: pairs the sources and targets of a batch by optimal transport.
+    r"""The coupling of OT-CFM: it pairs the sources and targets of a batch by optimal transport.
 
     The permutation :math:`\pi` of the sources minimises
 
@@ -62,7 +62,7 @@ class OTCoupling:
         self.observation_weight = observation_weight
 
     def config(self) -> dict[str, Any]:
-        """The options that it depends on."""
+        """Return the options as JSON holds them."""
         return {"name": "ot", "observation_weight": self.observation_weight}
 
     def __call__(
@@ -73,9 +73,9 @@ class OTCoupling:
         if len(source) < 2:
             raise ValueError("optimal transport pairs within a batch: it needs at least 2 windows")
         if self.observation_weight and not isinstance(observation, Tensor):
-            found = "none" if observation is None else "nested ones"
+            kind = "none" if observation is None else "nested ones"
             raise ValueError(
-                f"optimal transport compares observations that are one tensor each, and got {found}: "
+                f"optimal transport compares observations that are one tensor each, but got {kind}: "
                 "concatenate their entries, or set observation_weight=0"
             )
         paired = []
@@ -83,13 +83,13 @@ class OTCoupling:
         for group in torch.arange(len(source)).tensor_split(-(-len(source) // self.GROUP)):
             cost = _squared_distances(target[group], source[group])
             if isinstance(observation, Tensor) and self.observation_weight:
-                seen = observation.reshape(len(source), -1)[group]
-                cost = cost + self.observation_weight * _squared_distances(seen, seen)
+                vectors = observation.reshape(len(source), -1)[group]
+                cost = cost + self.observation_weight * _squared_distances(vectors, vectors)
             paired.append(source[group][self.assigned(cost.double().cpu()).to(source.device)])
         return torch.cat(paired).view_as(a0), a1
 
     def assigned(self, cost: Tensor) -> Tensor:
-        """The source of every target, by the cost of the pairs ``[n, n]``, float64 on the CPU."""
+        """Return the index of every target's source, for costs ``[n, n]``, float64 on the CPU."""
         from scipy.optimize import linear_sum_assignment
 
         return torch.as_tensor(linear_sum_assignment(cost.numpy())[1])
@@ -100,37 +100,37 @@ def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
 
 
 class ReflowCoupling:
-    r"""2-rectified flow: the target of every source is the end of a trained policy's flow.
+    r"""The coupling of 2-rectified flow: the target of every source is the end of a trained policy's flow.
 
-    Pairs :math:`(a_0, \hat a_1)`, with :math:`\hat a_1` the end of the teacher's flow at the window's
-    observation, are drawn anew for every batch (Liu et al., 2023): a step costs ``nfe`` more forward passes.
+    Every batch draws new pairs :math:`(a_0, \hat a_1)`, where :math:`\hat a_1` is the end of the teacher's
+    flow at the window's observation (Liu et al., 2023): a step costs ``nfe`` more forward passes.
 
     Args:
-        teacher: a trained policy of the same source; it is frozen, and moved to the device of the data.
-        nfe: its Euler steps.
+        teacher: a trained policy with the same source; it is frozen, and moved to the device of the data.
+        nfe: number of the teacher's Euler steps.
 
     Raises:
-        ValueError: if ``nfe`` is no whole number of at least 1, or chunks differ in shape from the teacher's.
+        ValueError: if ``nfe`` is not a whole number of at least 1, or chunks and teacher differ in length.
 
     Examples:
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.objectives import ReflowCoupling
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
-        >>> a0, a1, seen = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
-        >>> source, target = couple(a0, a1, seen)
+        >>> a0, a1, observation = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
+        >>> source, target = couple(a0, a1, observation)
         >>> source is a0, target.shape
         (True, torch.Size([5, 4, 2]))
     """
 
     def __init__(self, teacher: WarmPriorActor, nfe: int = 9) -> None:
         check_whole_numbers(nfe=nfe)
-        # Its flow alone, from the source at t = 0.
+        # Only the teacher's flow, from the source at t = 0.
         teacher = teacher.replace(start=None, guidance=None)
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 
     def config(self) -> dict[str, Any]:
-        """The options, with a digest of the teacher's weights."""
+        """Return the options, with a digest of the teacher's weights."""
         weights = {name: value.tolist() for name, value in self.teacher.state_dict().items()}
         return {"name": "reflow", "nfe": self.nfe, "teacher": digest_of(weights)}
 

@@ -26,52 +26,52 @@ Weighting = Literal["velocity", "standardised"]
 
 
 class FlowMatchingLoss(LossModule):
-    r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
+    r"""The loss of conditional flow matching with the actor's own source (Algorithm 1, training).
 
-    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1`, draw :math:`t \sim U(0, 1)`,
-    set :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress :math:`v_\theta(t, a_t, o)` on
+    For each window it draws :math:`a_0` from the prior, pairs it with :math:`a_1`, draws :math:`t \sim U(0,
+    1)`, sets :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regresses :math:`v_\theta(t, a_t, o)` on
     :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's end do not count.
 
     The L1 objective compares predicted samples instead of velocities (L1 Flow, Song et al., 2025,
-    arXiv:2511.17898). With :math:`\hat a_1 = a_t + (1 - t) v` a coordinate costs
+    arXiv:2511.17898). With :math:`\hat a_1 = a_t + (1 - t) v` the error of a coordinate is
 
     .. math::
-        |\hat a_1 - a_1| = (1 - t) \, |v_\theta(t, a_t, o) - (a_1 - a_0)|,
+        |\hat a_1 - a_1| = (1 - t) \, |v_\theta(t, a_t, o) - (a_1 - a_0)|.
 
-    and their two-step sampler is Euler's method with NFE 2.
+    The two-step sampler of L1 Flow is Euler's method with NFE 2.
 
     Args:
-        actor_network: the policy whose velocity network is trained; its prior gives the source.
-        coupling: pairs the sources and targets of a batch, see :data:`~warmprior.Coupling`; in
-            their order by default (Algorithm 1).
-        times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression), or a function of their signature (:data:`Times`).
+        actor_network: the policy whose velocity network is trained; its prior is the source.
+        coupling: a function that pairs the sources and targets of a batch, see :data:`~warmprior.Coupling`;
+            by default they are paired in order (Algorithm 1).
+        times: the distribution of training times: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
+            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
-        weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
-            the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that every
-            time, position and dimension counts alike, as in EDM (Karras et al., 2022, Table 1); the default
-            for a :class:`PreconditionedNetwork`. Without it, with a standard normal source and data of
-            deviation :math:`s`, errors at ``t = 0``, where one-step samplers are, count :math:`s^2` times
-            those at ``t = 1``.
-        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or the line.
+        weighting: ``"velocity"`` (Algorithm 1) leaves errors unchanged. ``"standardised"`` divides them by
+            the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that all
+            times, positions and dimensions have equal weight, as in EDM (Karras et al., 2022, Table 1); it is
+            the default for a :class:`PreconditionedNetwork`. With ``"velocity"``, a standard normal source
+            and data of deviation :math:`s`, errors at ``t = 0``, the time of one-step samplers, have
+            :math:`s^2` times the weight of those at ``t = 1``.
+        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or linear.
         reduction: ``"mean"`` over coordinates that count (Algorithm 1 divided by their number, or by the sum
-            of their weights), ``"sum"`` (Algorithm 1's) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
-        generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
+            of their weights), ``"sum"`` (Algorithm 1) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
+        generator: draws ``t`` and :math:`a_0`; by default that of the actor's sampler.
 
     .. note::
-        Keys read (renameable by :meth:`set_keys`; those of :class:`~warmprior.ActionWindow`, whatever keys of
-        its own the policy has): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool ``[*B, P]``
-        (optional), the ``history`` (:mod:`warmprior.history`) and ``observation`` ``[*B, To, d_o]``; where
-        they are there, TorchRL's ``priority_weight`` ``[*B]`` and the masks of its ``loss_mask_key``, such as
-        ``("collector", "mask")`` of padded trajectories. Batches are moved to the network's device, where the
-        generator has to be.
+        The loss reads ``chunk`` ``[*B, P, d_a]``, ``history`` (:mod:`warmprior.history`), ``observation``
+        ``[*B, To, d_o]`` and, if present, ``pad_mask`` bool ``[*B, P]``, TorchRL's ``priority_weight``
+        ``[*B]`` and the masks of its ``loss_mask_key``, such as ``("collector", "mask")`` of padded
+        trajectories. By default these are the keys of :class:`~warmprior.ActionWindow`, even if the policy
+        has other keys; :meth:`set_keys` renames them. Batches are moved to the network's device, where the
+        generator must be too.
 
     Raises:
-        ValueError: for an unknown option, or options that do not fit each other, the network or the policy.
+        ValueError: if an option is unknown, or does not fit another option, the network or the policy.
 
     See Also:
-        :class:`~warmprior.SelfDistillationLoss`: teaches the sampler of one step where the flow ends.
-        :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
+        :class:`~warmprior.SelfDistillationLoss`: trains one integration step to end where the flow ends.
+        :class:`~warmprior.training.BehaviourCloning`: the training loop around this loss.
 
     Examples:
         >>> import torch
@@ -89,7 +89,7 @@ class FlowMatchingLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Configurable tensordict keys, see the class docstring."""
+        """The configurable tensordict keys, see the class docstring."""
 
         chunk: NestedKey = keys.CHUNK
         pad_mask: NestedKey = keys.IS_PAD
@@ -146,13 +146,13 @@ class FlowMatchingLoss(LossModule):
         self.set_keys(observation=actor_network.observation_key)
 
     def _set_in_keys(self) -> None:
-        """TorchRL calls it from :meth:`set_keys`."""
+        """Set ``in_keys``, when TorchRL calls it from :meth:`set_keys`."""
         k = self.tensor_keys
         self.in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the loss of a batch of windows; a ``KeyError`` if a needed key is missing."""
+        """Return the loss of a batch of windows; raise KeyError if a needed key is missing."""
         a0, a1, observation, weight = self.ends(tensordict)
         t = self.times(a1.shape[:-2], self.generator, a1.dtype, a1.device)
         a_t, velocity = self.interpolant(a0, a1, t, self.generator)
@@ -164,9 +164,9 @@ class FlowMatchingLoss(LossModule):
     def ends(
         self, tensordict: TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor | TensorDictBase, Tensor | None]:
-        """Return the ends of the paths, ``[*B, P, d_a]``, flat observations, and how much positions count.
+        """Return both ends of the paths, ``[*B, P, d_a]``, flat observations, and the positions' weights.
 
-        Weights are ``[*B, P]``, or ``None`` where all count alike.
+        Weights are ``[*B, P]``, or ``None`` if all are equal.
         """
         k, actor = self.tensor_keys, self.actor_network
         needed = (k.chunk, k.history, k.observation)
@@ -186,7 +186,7 @@ class FlowMatchingLoss(LossModule):
         factors += [tensordict.get(key, None) for key in self._loss_mask_keys()]
         for factor in factors:
             if factor is not None:
-                # Of windows `[*B]` or `[*B, 1]`, or of positions `[*B, P]`.
+                # A factor weights windows `[*B]` or `[*B, 1]`, or positions `[*B, P]`.
                 factor = factor.to(a1).reshape(*factor.shape, *(1,) * (a1.ndim - 1 - factor.ndim))
                 weight = factor if weight is None else weight * factor
         return None if weight is None else weight.expand(a1.shape[:-1])
@@ -203,7 +203,7 @@ class FlowMatchingLoss(LossModule):
         """Reduce errors ``[*B, P, d_a]`` with weights ``[*B, P]``."""
         count: Tensor | int = max(1, error.numel())
         if weight is not None:
-            # What does not count may be NaN. Where nothing does, the mean is 0.
+            # Errors without weight may be NaN. If no error has weight, the mean is 0.
             error = torch.where(weight.unsqueeze(-1) == 0, 0.0, error * weight.unsqueeze(-1))
             total = weight.sum() * error.shape[-1]
             count = torch.where(total > 0, total, 1.0)

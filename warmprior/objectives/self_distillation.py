@@ -16,37 +16,37 @@ from warmprior.modules.ode import integrate
 from warmprior.objectives.flow_matching import FlowMatchingLoss, check_straight
 
 TEACHER_STEPS = 9
-"""Euler steps, as in the paper, that one step learns to make."""
+"""The number of Euler steps, as in the paper, that one step learns to replace."""
 
 SHARE = 0.25
-"""Share of a batch, as in shortcut models: each of these windows costs nine more forward passes."""
+"""The distilled share of a batch, as in shortcut models: each of these windows costs nine forward passes."""
 
 
 class SelfDistillationLoss(FlowMatchingLoss):
-    r"""Trains the sampler of one step on where the flow of averaged weights :math:`\bar\theta` ends.
+    r"""A loss that trains one integration step to end where the flow of averaged weights ends.
 
-    At the time :math:`s` at which the policy's samplers start,
+    With averaged weights :math:`\bar\theta`, at the time :math:`s` at which integration starts, it is
 
     .. math::
         \left\| v_\theta(s, a_s, o) - \frac{\hat a_1 - a_s}{1 - s} \right\|^2, \qquad
         \hat a_1 = \Phi^{\bar\theta}_{s + h \to 1}(a_{s + h}), \qquad h = \frac{1 - s}{9},
 
     where :math:`\Phi` is the flow by Euler's method with steps of :math:`h`, and :math:`a_{s+h}` lies on the
-    data's own path. Add it to a :class:`FlowMatchingLoss`, which keeps the network a flow at all other times.
-    The idea is the self-consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480), but only the
-    whole interval is learnt, the teacher crosses it in steps (progressive distillation), and there is no
+    data's own path. Add it to a :class:`FlowMatchingLoss`, which trains the flow at all other times. The idea
+    is the self-consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480), but only the whole
+    interval is learnt, the teacher crosses it in steps (progressive distillation), and there is no
     self-guidance. The first quarter of a batch is distilled, as in shortcut models (Frans et al., 2025); both
-    losses take about twice the time of the first.
+    losses together take about twice the time of flow matching alone.
 
     Args:
         actor_network: the policy whose velocity network is trained.
-        teacher: the network of averaged weights; by default the trained one. It is neither trained nor saved
-            with the loss.
-        **options: of :class:`FlowMatchingLoss`; the times have no effect. Unreduced, the loss is that of the
-            distilled windows, ``[n, P, d_a]``.
+        teacher: the network with averaged weights; by default the trained one. It is neither trained nor
+            saved with the loss.
+        **options: options of :class:`FlowMatchingLoss`; ``times`` has no effect. With ``reduction="none"``
+            the loss is that of the distilled windows, ``[n, P, d_a]``.
 
     Raises:
-        ValueError: if the policy is trained at ``t = 0`` alone, or the path is not straight.
+        ValueError: if the policy is trained at ``t = 0`` only, or the path is not straight.
 
     Examples:
         >>> import torch
@@ -67,13 +67,13 @@ class SelfDistillationLoss(FlowMatchingLoss):
     ) -> None:
         super().__init__(actor_network, **options)
         if actor_network.sampling.max_nfe == 1:
-            raise ValueError("self-distillation needs a flow, and the policy is trained at t = 0 alone")
+            raise ValueError("self-distillation needs a flow, but the policy is trained at t = 0 only")
         check_straight(self.interpolant)
         self.__dict__["teacher"] = teacher  # not part of this module: its owner saves it
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the loss of a batch of windows; a ``KeyError`` if a needed key is missing."""
+        """Return the loss of a batch of windows; raise KeyError if a needed key is missing."""
         a0, a1, observation, weight = self.ends(tensordict)
         n = max(1, round(SHARE * a1.shape[:-2].numel()))
         a0, a1 = (end.detach().reshape(-1, *end.shape[-2:])[:n] for end in (a0, a1))

@@ -1,4 +1,4 @@
-"""How the times of a flow-matching loss are distributed."""
+"""Distributions of the times of a flow-matching loss."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torch import Tensor
 from warmprior.checks import check_choice
 
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
-"""Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
+"""A function that draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 
 TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
 
 STEEPNESS = 4.0
-"""``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
+"""The constant ``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
 
 
 def uniform_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Draw all times alike, as in Algorithm 1."""
+    """Draw uniformly distributed times, as in Algorithm 1."""
     return torch.rand(shape, generator=generator, dtype=dtype, device=device)
 
 
@@ -54,7 +54,7 @@ def logit_normal_times(
 def start_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    r"""Give ``t = 0`` alone: the network regresses :math:`a_1 - a_0`, which one Euler step returns.
+    r"""Return ``t = 0`` for all: the network regresses :math:`a_1 - a_0`, which one Euler step adds.
 
     The field is not trained at any other time: build the policy with ``max_nfe=1``.
     """
@@ -67,10 +67,10 @@ TIMES: dict[str, Times] = {
     "logit-normal": logit_normal_times,
     "start": start_times,
 }
-"""Distributions of times by name."""
+"""The distributions of times, by name."""
 
 
 def chosen_times(name: str) -> Times:
-    """Return the distribution of a name; a ``ValueError`` lists the names."""
+    """Return the distribution with a name; raise ValueError, with the names, if there is none."""
     check_choice("times", name, TIMES)
     return TIMES[name]
