@@ -129,7 +129,7 @@ def test_bad_lengths(horizon, options, said):
 
 def test_the_reward_is_no_measure():
     env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
-    with pytest.raises(ValueError, match="cannot be the reward 'reward'"):
+    with pytest.raises(ValueError, match="the reward 'reward'"):
         env.step(ones(2)(env.reset()))
 
 

@@ -212,12 +212,12 @@ def test_numbers_that_do_not_go_together():
         InferenceDelay(4, execute=3)
     with pytest.raises(ValueError, match="delay must be a whole number of at least 0"):
         InferenceDelay(1.5, execute=3)
-    with pytest.raises(ValueError, match=r"6 actions do not reach 5.*delay of 2.*at most 4"):
+    with pytest.raises(ValueError, match=r"6 actions.*5.*delay of 2.*at most 4"):
         TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)).reset()
     with pytest.raises(ValueError, match=r"delay of 4.*too long for.* 6 .*at most 3"):
         policy_transforms(PRIORS["past"], delay=4)
     # As many as the delay leaves are executed.
     whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
     assert whole.rollout(2, lagging(6))["next", "executed_steps"].flatten().tolist() == [4, 4]
-    with pytest.raises(KeyError, match=r"delay.*Hand over"):
+    with pytest.raises(KeyError, match=r"delay.*reset"):
         whole.step(lagging(6)(whole.reset()).exclude("rtc"))

@@ -114,7 +114,7 @@ def test_without_chunk_step_before_it(order):
 def test_a_step_without_the_history():
     env = TransformedEnv(CountingEnv(5), policy_transforms(PastPrior(3)))
     data = env.rand_action(env.reset())
-    with pytest.raises(KeyError, match=r"ActionHistory found no 'history'.*hand over what the res"):
+    with pytest.raises(KeyError, match=r"ActionHistory found no 'history'.*reset or step"):
         env.step(data.exclude("history"))
 
 

@@ -1,4 +1,4 @@
-"""Absolute poses as the actions of an environment that takes pose deltas."""
+"""Absolute poses as actions for an environment that takes pose deltas."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
 from warmprior.transforms.inner_step import KEPT, EnvTransform
 
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
-_REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
+_REACH = 2.0  # metres, the bound of positions in the action spec; it only limits random samples
 
 
 class AbsoluteActions(EnvTransform):
-    r"""Turns the pose that an action asks for into the delta from where the gripper is now.
+    r"""A transform of target poses into deltas from the gripper's current pose.
 
     Per arm an action holds a position in metres in the world, the first two rows of a rotation matrix (any
     two that are not parallel) and the gripper, as :func:`~warmprior.envs.absolute_actions` computes them:
-    ``"action"`` ``[*B, 10 * arms]``. The environment below gets ``[*B, 7 * arms]``,
+    ``"action"`` ``[*B, 10 * arms]``. The wrapped environment gets ``[*B, 7 * arms]``,
 
     .. math:: \mathrm{clip}\bigl((p^* - p) / s_p\bigr), \quad
               \mathrm{clip}\bigl(\log(R^* R^\top) / s_R\bigr)
 
     and the gripper, where :math:`(p, R)` is the gripper's pose before the step, ``"eef_pose"`` ``[*B, arms,
     3, 4]`` (:mod:`warmprior.keys`). A pose beyond the reach of one control step is approached at full speed.
-    It acts on every control step: place it next to the environment (:func:`policy_transforms` does so).
+    It acts on every control step: append it directly to the environment (:func:`policy_transforms` does so).
 
     Args:
-        output_max: ``[6]``, what an input of 1 means, in metres and radians; see
-            :func:`~warmprior.envs.delta_conventions`, also for the next.
-        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; by default one arm in it.
+        output_max: ``[6]``, the motion at an input of 1, in metres and radians, see
+            :func:`~warmprior.envs.delta_conventions`.
+        base_rotation: ``[arms, 3, 3]``, the rotation from the frame of the deltas to the world, from the same
+            function; by default one arm whose frame is the world's.
 
     Raises:
         ValueError: if the shapes do not fit each other, or (in an environment) its actions.
-        KeyError: if there is no pose.
+        KeyError: if the environment writes no pose.
 
     Examples:
         >>> import torch
@@ -70,17 +71,17 @@ class AbsoluteActions(EnvTransform):
 
     @property
     def arms(self) -> int:
-        """How many arms act."""
+        """The number of arms."""
         return len(self.base_rotation)
 
     @property
     def one_step(self) -> Tensor:
-        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper."""
+        """The largest change of each action entry in a control step, ``[10 * arms]``; 0 for the gripper."""
         position, turn = self.scale[:3], self.scale[3:].amin()
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
 
     def delta(self, action: Tensor, pose: Tensor) -> Tensor:
-        """The delta ``[*B, 7 * arms]`` towards actions ``[*B, 10 * arms]`` at poses ``[*B, arms, 3, 4]``."""
+        """Return the delta ``[*B, 7 * arms]`` to actions ``[*B, 10 * arms]`` from ``[*B, arms, 3, 4]``."""
         target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
         move = target[..., :3] - now[..., 3]
         turn = rotation_6d_to_matrix(target[..., 3:9]) @ now[..., :3].mT
@@ -89,7 +90,7 @@ class AbsoluteActions(EnvTransform):
         return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # A partial step of a batched environment has set its observations aside.
+        # In a partial step of a batched environment the observations are under KEPT.
         kept = tensordict.get(KEPT, None)
         pose = tensordict.get(keys.EEF_POSE, None)
         if pose is None and kept is not None:
@@ -114,8 +115,8 @@ class AbsoluteActions(EnvTransform):
         leaf = actions[keys.ACTION]
         if leaf.shape[-1] != self.arms * _DELTA:
             raise ValueError(
-                f"AbsoluteActions of {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but the "
-                f"environment's have {leaf.shape[-1]}"
+                f"AbsoluteActions for {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but "
+                f"the environment's have {leaf.shape[-1]}"
             )
         limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)
         limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)

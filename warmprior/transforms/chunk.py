@@ -34,7 +34,7 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
 }
-"""Transforms without memory, by type: how many of the last observations their output depends on."""
+"""The number of last observations that the output of a transform without memory depends on, by type."""
 
 _REFUSED: dict[type[Transform], str] = {
     ActionDiscretizer: "whose actions are indices, and those of chunks numbers: leave it out",
@@ -43,12 +43,13 @@ _REFUSED: dict[type[Transform], str] = {
 
 
 class LateTransforms:
-    """Runs control steps first, and their transforms afterwards, for the steps that count.
+    """A loop that runs all control steps first, and then the transforms of the steps that are read.
 
-    A decision of ``k`` control steps is read once, at its end; transforming all observations only to discard
-    most costs more than anything else here beside a fast simulator. The result equals that of transforming
-    every step, bit by bit. The environment's own ``control_steps`` (see :class:`ChunkStep`) is used where
-    actions can be inverted at once and only reward and flags of the first steps are read (``brief``).
+    A decision of ``k`` control steps is read once, at its end; with a fast simulator, transforming all
+    observations only to discard most of them would take most of the time. The result equals that of
+    transforming every step, bit for bit. The environment's own ``control_steps`` (see :class:`ChunkStep`) is
+    used if all actions can be inverted at once and only reward and flags of the first steps are read
+    (``brief``).
     """
 
     def __init__(self, step: InnerStep, action_key: NestedKey, brief: bool) -> None:
@@ -68,16 +69,16 @@ class LateTransforms:
     def of(
         cls, step: InnerStep, read: Iterable[NestedKey], action_keys: Sequence[NestedKey]
     ) -> LateTransforms | None:
-        """Return such steps, or ``None`` where ``read`` needs every transform to run at every step."""
+        """Return such a loop, or ``None`` if ``read`` needs every transform to run at every step."""
         transforms, base = step.transforms, step.base
         (action_key, *others) = action_keys
-        # The lean loop sets one entry at the root. A transformed environment has transforms of its own, which
-        # may read what these write.
+        # The lean loop sets one entry at the root. The own transforms of a transformed environment may read
+        # entries that these transforms write.
         if others or isinstance(action_key, tuple) or isinstance(base, TransformedEnv):
             return None
         if any(type(transform) not in _REACH for transform in transforms):
             return None
-        # An environment reads its action and states alone: other observations may reach it untransformed.
+        # An environment reads only its action and states: other observations may reach it untransformed.
         written = _roots(key for t in transforms for key in t.out_keys)
         looked_at = [keys.EEF_POSE for t in transforms if isinstance(t, AbsoluteActions)]
         needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
@@ -90,9 +91,9 @@ class LateTransforms:
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
     ) -> list[TensorDictBase]:
-        """Take steps with actions ``[*B, n, d_a]`` after ``first`` until an environment is done; all results.
+        """Return the results of ``first`` and actions ``[*B, n, d_a]`` until an environment is done.
 
-        ``current`` becomes the input of the last one in place; only what that led to is transformed.
+        ``current`` becomes the input of the last step, in place; only that step's result is transformed.
         """
         results, actions = [first], self._inverse(actions)
         if self._control_steps is None:
@@ -106,13 +107,13 @@ class LateTransforms:
     def _steps(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
     ) -> list[TensorDictBase]:
-        """One step after the other, untransformed."""
+        """Take one step after the other, untransformed."""
         results: list[TensorDictBase] = []
         for action in actions.unbind(0):
             update_input(current, results[-1] if results else first, reward_key)
             if current["done"].any():
                 break
-            # Without the constructor's checks: the entries come out of tensordicts of this batch size.
+            # The constructor's checks are skipped: all entries come from tensordicts of this batch size.
             entries = current | {self._action_key: action}
             inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
             for transform in reversed(self._one_by_one):
@@ -121,7 +122,7 @@ class LateTransforms:
         return results
 
     def _inverse(self, actions: Tensor) -> Tensor:
-        # Elementwise: all of them at once, time first, so that what a transform has per row broadcasts.
+        # All of them at once, time first, so that per-row parameters of a transform broadcast.
         actions = actions.movedim(-2, 0)
         for transform in reversed(self._at_once):
             if transform.in_keys_inv:
@@ -129,7 +130,7 @@ class LateTransforms:
         return actions
 
     def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:
-        # What lies further back than they reach has no influence, so that `before` may be older.
+        # Results further back than the transforms reach have no influence, so `before` may be older.
         for result in results[-self._reach :]:
             for transform in self._transforms:
                 result = transform._step(before, result)
@@ -138,16 +139,16 @@ class LateTransforms:
 
 
 def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase]] | None:
-    """That of an environment whose ``_step`` is the one that it goes with: a subclass may have another."""
+    """Return the environment's ``control_steps`` if one class defines it and ``_step``, else ``None``."""
     owner = next((cls for cls in type(base).__mro__ if "control_steps" in vars(cls)), None)
     same = owner is not None and type(base)._step is owner._step  # type: ignore[attr-defined]
     return getattr(base, "control_steps", None) if same else None
 
 
 def update_input(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
-    """A lean ``step_mdp``, in place and without the reward: it runs at every control step."""
+    """Move a step's result into ``current``: a lean ``step_mdp``, in place and without the reward."""
     for key, value in next_tensordict.items():
-        # The type first: nearly all are plain tensors, and the instance check is slow.
+        # The type is compared first: nearly all are plain tensors, and the instance check is slow.
         if (
             type(value) is not Tensor
             and is_tensor_collection(value)
@@ -164,53 +165,54 @@ def _roots(names: Iterable[NestedKey]) -> set[str]:
 
 
 class ChunkStep(EnvTransform):
-    r"""Turns an environment of single actions into one of action chunks (a semi-MDP).
+    r"""A transform that lets an environment of single actions take action chunks (a semi-MDP).
 
     One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, and stops each
     sub-environment at the end of its own episode. The reward is the discounted sum :math:`\sum_{i<k} \gamma^i
-    r_i` over the ``k`` executed steps, written to ``("next", "executed_steps")``; everything but ``success``
-    and ``measures`` is taken from the last of them. Unlike :class:`~torchrl.envs.transforms.MultiAction` it
-    keeps the last reward of an episode that ends inside a chunk, and works inside and outside batched
-    environments.
+    r_i` over the ``k`` executed steps, and ``("next", "executed_steps")`` is ``k``. All other entries, except
+    ``success`` and ``measures``, come from the last executed step. Unlike
+    :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends inside a
+    chunk, and works inside and outside batched environments.
 
-    Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``, ``VideoRecorder``)
-    go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. If none of the former
-    remembers anything (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they run only at
-    the steps that a chunk's last observation depends on. In a partial step, resting rows keep all
-    observations.
+    Append it after per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
+    ``VideoRecorder``) and before per-decision ones (:class:`ActionHistory`, ``InitTracker``). If all per-step
+    transforms are without memory (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they
+    run only at the steps that a chunk's last observation depends on. In a partial step, rows that are not
+    stepped keep all observations.
 
     An environment without batch dimensions may take all steps of a chunk in one call, as
-    :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It then has a method
-    ``control_steps(actions, keep)``, defined in the class that defines ``_step``: it takes raw actions
+    :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It needs a method
+    ``control_steps(actions, keep)``, defined in the class that defines ``_step``: it executes raw actions
     ``[n, d_a]`` until the episode ends, and returns a tensordict per step, the last ``keep`` of them as
-    ``_step`` returns them, the earlier ones with reward, flags and ``"success"`` alone.
+    ``_step`` returns them, the earlier ones with only reward, flags and ``"success"``.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
-        ``VecNormV2``, update it in all rows, also in those that a partial step leaves out. If rows rest for
-        longer than until their reset, place such transforms inside the workers. :class:`ObservationStack` has
-        no such memory.
+        ``VecNormV2``, update it in all rows, including those that a partial step leaves out. If rows stay out
+        for longer than until their reset, place such transforms inside the workers.
+        :class:`ObservationStack` has no such memory.
 
     Args:
         chunk_length: ``H``.
-        execute: ``k``, how many actions of a chunk are executed before the next decision; ``H`` by default.
-        prediction_length: ``P``, the length of the chunks that the policy gives; ``H`` by default.
+        execute: ``k``, the number of actions of a chunk that are executed before the next decision; ``H`` by
+            default.
+        prediction_length: ``P``, the length of the policy's chunks; ``H`` by default.
         gamma: discount per control step.
-        success: a bool flag that holds after a chunk if it held after any of its executed steps; ignored if
-            the environment does not write it.
-        measures: further keys whose values after a chunk are the ``"max"``, ``"sum"`` or ``"last"`` of those
-            after its executed steps.
-        action_keys: the environment's actions, vectors ``[*B, d_a]``, or ``[*B, n, d_a]`` of the ``n`` agents
-            of a group.
-        chunk_keys: the chunks in their place, ``[*B, P, d_a]`` or ``[*B, n, P, d_a]``. Several policies, or
-            agents, act in one environment by keys of their own.
+        success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
+            ignored if the environment does not write it.
+        measures: further keys, each with ``"max"``, ``"sum"`` or ``"last"``, which reduces the values after
+            the executed steps to the value after a chunk.
+        action_keys: keys of the environment's actions, vectors ``[*B, d_a]``, or ``[*B, n, d_a]`` for the
+            ``n`` agents of a group.
+        chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]`` or ``[*B, n, P, d_a]``. Policies or
+            agents that act in the same environment need different keys.
 
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
-            or keys are not as many.
-        KeyError: (in an environment) if there is no such action, or another one that nobody would choose.
+            or there are not as many chunk keys as action keys.
+        KeyError: (in an environment) if there is no such action, or an action without a chunk key.
         RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, skips
-            single steps, or restarts rows by itself so that the rest of a chunk would be played in the next
+            single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
             episode.
 
     Examples:
@@ -246,8 +248,8 @@ class ChunkStep(EnvTransform):
         prediction_length = chunk_length if prediction_length is None else prediction_length
         check_whole_numbers(chunk_length=chunk_length, execute=execute)
         if not execute <= chunk_length <= prediction_length:
-            given = f"{execute}, {chunk_length} and {prediction_length}"
-            raise ValueError(f"need execute <= chunk_length <= prediction_length, got {given}")
+            lengths = f"{execute}, {chunk_length} and {prediction_length}"
+            raise ValueError(f"need execute <= chunk_length <= prediction_length, got {lengths}")
         self.chunk_length = chunk_length
         self.execute = execute
         self.prediction_length = prediction_length
@@ -265,7 +267,7 @@ class ChunkStep(EnvTransform):
         rows = tensordict.get("_step", None)
         if rows is not None:
             set_aside(tensordict, inner.observed)
-            if not rows.any():  # TorchRL skips the decision, and copies what it finds
+            if not rows.any():  # TorchRL skips the decision, and copies the input
                 self._input = None
                 tensordict.set(keys.EXECUTED, torch.zeros_like(tensordict.get(keys.EXECUTED)))
         for key, chunk in chunks.items():
@@ -273,7 +275,7 @@ class ChunkStep(EnvTransform):
         return tensordict
 
     def _chunks(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """Return the chunks of a decision by the keys of their actions."""
+        """Return the chunks of a decision, by action key."""
         chunks = {}
         for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             chunks[action_key] = chunk = tensordict.get(chunk_key)
@@ -285,7 +287,7 @@ class ChunkStep(EnvTransform):
         return chunks
 
     def _inner_step(self) -> tuple[InnerStep, LateTransforms | None, NestedKey]:
-        """How to step what this transform wraps, also with late transforms, and the key of its reward."""
+        """Return the step of the wrapped environment, its loop with late transforms, and its reward key."""
         parent = self.parent
         if self._inner is None or self._inner[0] is not parent:
             # TorchRL builds another parent whenever the transforms change.
@@ -298,8 +300,8 @@ class ChunkStep(EnvTransform):
                 )
             if rewards[0] in self.measures:
                 raise ValueError(
-                    f"measures of ChunkStep cannot be the reward {rewards[0]!r}, which after a chunk is its "
-                    "return: have the environment write it under another key as well"
+                    f"measures of ChunkStep cannot include the reward {rewards[0]!r}, which after a chunk is "
+                    "its return: have the environment write it under another key as well"
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
@@ -312,20 +314,20 @@ class ChunkStep(EnvTransform):
         return self._inner[1:]
 
     def _check_shapes(self, base: EnvBase, parent: EnvBase) -> None:
-        """Refuse ends that are not of rows, and observations that differ between rows."""
+        """Raise ValueError unless every row has one end flag and observations of the same shapes."""
         done, batch = parent.full_done_spec["done"].shape, parent.batch_size
         if tuple(done) != (*batch, 1):
             raise RuntimeError(
-                f"ChunkStep needs an end per row, 'done' of shape {[*batch, 1]}, and the environment has "
-                f"{list(done)}: reduce it, or nest those of agents under a key"
+                f"ChunkStep needs one end per row, 'done' of shape {[*batch, 1]}, but the environment has "
+                f"{list(done)}: reduce it, or nest the agents' flags under a key"
             )
         uneven = [
             k for k, leaf in base.observation_spec.items(True, True) if -1 in getattr(leaf, "shape", ())
         ]
         if uneven:
             raise RuntimeError(
-                f"the observations {uneven} have other shapes in other rows, and ChunkStep merges rows: "
-                "append it to the environments inside of the workers"
+                f"the shapes of the observations {uneven} differ between rows, and ChunkStep merges rows: "
+                "append it to the environments inside the workers"
             )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -338,11 +340,11 @@ class ChunkStep(EnvTransform):
         next_tensordict = (
             next_tensordict.clone()
         )  # an environment may write the next one into the same memory
-        # A plain dictionary: a tensordict's checks would be made at every control step.
+        # A plain dictionary, because a tensordict would check its entries at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
         current.pop("_step", None)
-        # Which environments go on; None for all of them, the usual case, which needs no masks.
+        # The environments that go on; None for all of them, the usual case, which needs no masks.
         alive: Tensor | None = tensordict.get("_step", None)
         if alive is not None:
             alive = alive.view(batch)
@@ -374,7 +376,7 @@ class ChunkStep(EnvTransform):
                 steps += 1
             else:
                 reward = torch.where(expand_as_right(alive, reward), reward, 0)
-                # Rows that a simulator has restarted show where it is now: in the end, a fresh reset.
+                # Rows that a simulator has restarted show its current state: at the end, a fresh reset.
                 but = self._shown() if step.restarts.native else ()
                 next_tensordict = rows_where(alive, result, next_tensordict, but)
                 steps += alive
@@ -403,11 +405,11 @@ class ChunkStep(EnvTransform):
         return next_tensordict
 
     def _shown(self) -> set[NestedKey]:
-        """The observations that are of one moment, and not of a chunk."""
+        """Return the keys of observations that describe one moment, and not a chunk."""
         return {*self.parent.observation_spec.keys(True, True)} - {self.success, *self.measures}
 
     def _return(self, rewards: list[Tensor]) -> Tensor:
-        """The discounted sum, accumulated in floating point."""
+        """Return the discounted sum, accumulated in floating point."""
         total = rewards[0]
         if not total.is_floating_point():
             total = total.to(torch.get_default_dtype())
@@ -416,7 +418,7 @@ class ChunkStep(EnvTransform):
         return total
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        self._inner_step()  # what does not fit is refused before the first step, and a compiled one finds it
+        self._inner_step()  # raises errors before the first step, and exists before a step is compiled
         shape = (*tensordict_reset.batch_size, 1)
         executed = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
         return tensordict_reset.set(keys.EXECUTED, executed)
@@ -427,8 +429,8 @@ class ChunkStep(EnvTransform):
         present = set(actions.keys(True, True))
         if present != set(self.in_keys_inv):
             raise KeyError(
-                f"the environment takes the actions {sorted(map(str, present))}, and ChunkStep has "
-                f"action_keys {self.in_keys_inv}: name all of them, with a chunk_key each"
+                f"the environment takes the actions {sorted(map(str, present))}, but ChunkStep has "
+                f"action_keys {self.in_keys_inv}: name all actions, with a chunk_key each"
             )
         for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             leaf = actions[action_key]
@@ -443,11 +445,11 @@ class ChunkStep(EnvTransform):
             actions[chunk_key] = leaf.unsqueeze(-2).expand(*agents, self.prediction_length, width).clone()
             del actions[action_key]
             if isinstance(action_key, tuple) and actions[action_key[0]].is_empty():
-                del actions[action_key[0]]  # it would count as an action
+                del actions[action_key[0]]  # an empty group would count as an action
         return input_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """The discounted sum of up to ``execute`` rewards."""
+        """Replace the reward by the discounted sum of up to ``execute`` rewards."""
         for key, leaf in list(reward_spec.items(True, True)):
             dtype = leaf.dtype if leaf.dtype.is_floating_point else torch.get_default_dtype()
             reward_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)

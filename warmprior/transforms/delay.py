@@ -1,4 +1,4 @@
-"""Execution of chunks that take effect late, because computing them takes time."""
+"""Execution of chunks that take effect late because computing them takes time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
-    """A ``ValueError`` if chunks of ``length`` cannot take effect ``delay`` control steps late."""
+    """Raise ValueError if chunks of ``length`` cannot take effect ``delay`` control steps late."""
     check_whole_numbers(0, delay=delay)
     if length is not None and 2 * delay > length:
         raise ValueError(
@@ -29,7 +29,7 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         )
     if length is not None and execute + delay > length:
         raise ValueError(
-            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay}: "
+            f"predictions of {length} actions do not cover {execute} executed ones and a delay of {delay}: "
             f"execute at most {length - delay} per decision, or predict longer chunks"
         )
 
@@ -39,7 +39,7 @@ def executed_chunk(
 ) -> Tensor:
     """Return the chunks of decisions ``[*B]`` as they are executed.
 
-    A late one begins with the rest of the last; without a recorded delay they are executed as they are.
+    A late chunk begins with the rest of the one before; without a recorded delay, chunks do not change.
 
     Examples:
         >>> import torch
@@ -59,27 +59,29 @@ def executed_chunk(
 
 
 class InferenceDelay(EnvTransform):
-    """Makes every chunk take effect ``delay`` control steps after the observation that it answers.
+    """A transform that delays every chunk: it takes effect ``delay`` control steps after its observation.
 
-    Simulators wait for policies, and robots do not. Here the robot goes on meanwhile: the first ``delay`` of
-    the ``execute`` actions come from the chunk before, and the rest from the new chunk. At the first decision
-    of an episode the robot waits. The policy decides every ``execute`` steps, so predictions have to reach
-    ``execute + delay``: with ``H = P`` (Gaussian source, WP-Past) fewer actions are executed per decision.
+    Simulators wait for policies; robots do not. Here the robot goes on during the computation: the first
+    ``delay`` of the ``execute`` actions come from the previous chunk, the rest from the new one. At the first
+    decision of an episode the robot waits. The policy decides every ``execute`` steps, so predictions must
+    cover ``execute + delay``: with ``H = P`` (Gaussian source, WP-Past) fewer actions are executed per
+    decision.
 
-    It has no state. Append it after :class:`ActionHistory`, which then remembers what was executed. It writes
-    ``("rtc", "delay")``, int64 ``[*B, 1]``: ``delay``, and 0 at the first decision of an episode, which
-    :class:`~warmprior.RealTimeChunking` reads. :func:`executed_chunk` gives the executed chunks of a rollout.
+    It has no state. Append it after :class:`ActionHistory`, which then remembers the executed actions. It
+    writes ``("rtc", "delay")``, int64 ``[*B, 1]``, which :class:`~warmprior.RealTimeChunking` reads:
+    ``delay``, or 0 at the first decision of an episode. :func:`executed_chunk` returns the executed chunks of
+    a rollout.
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.
-        execute: actions executed per decision, as :class:`ChunkStep` has it.
+        execute: actions executed per decision, the same as in :class:`ChunkStep`.
         chunk_key: key of the chunk.
         history_key: key of the history.
 
     Raises:
         ValueError: if not ``0 <= delay <= execute`` (the next decision would be due before the last one took
             effect), or (in an environment) ``execute + delay`` exceeds the length of predictions.
-        KeyError: if :class:`ActionHistory` does not come before, or a step's input lacks delay or history.
+        KeyError: if :class:`ActionHistory` does not precede it, or a step's input lacks delay or history.
         RuntimeError: (on a step) if a decision executed more than ``execute`` actions.
 
     Examples:
@@ -112,7 +114,7 @@ class InferenceDelay(EnvTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         needed = (*self.in_keys, keys.DELAY)
-        check_keys(tensordict, needed, "InferenceDelay", ". Hand over what the reset or the step before gave")
+        check_keys(tensordict, needed, "InferenceDelay", ". Step from the last reset's or step's tensordict")
         if tensordict.get(self.chunk_key, None) is None:
             return tensordict  # ChunkStep raises
         executed = executed_chunk(tensordict, self.chunk_key, self.history_key)
@@ -122,8 +124,8 @@ class InferenceDelay(EnvTransform):
         executed = next_tensordict.get(keys.EXECUTED)
         if (executed > self.execute).any():
             raise RuntimeError(
-                f"a decision executed {int(executed.max())} actions, and InferenceDelay has "
-                f"execute={self.execute}: give it the number that ChunkStep has"
+                f"a decision executed {int(executed.max())} actions, but InferenceDelay has "
+                f"execute={self.execute}: give it the same number as ChunkStep"
             )
         next_tensordict.set(keys.DELAY, torch.full_like(executed, self.delay))
         return keep_resting(tensordict, next_tensordict, [keys.DELAY])
@@ -140,7 +142,7 @@ class InferenceDelay(EnvTransform):
             raise KeyError(f"InferenceDelay found no {forecast}: append it after ActionHistory")
         check_unwritten(observation_spec, self.out_keys, "InferenceDelay")
         if observation_spec[forecast].ndim > observation_spec.ndim + 2:
-            raise ValueError("InferenceDelay and guidance take no group of agents: leave them out")
+            raise ValueError("InferenceDelay and guidance do not support groups of agents: leave them out")
         check_delay(self.delay, self.execute, observation_spec[forecast].shape[-2])
         observation_spec[keys.DELAY] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device

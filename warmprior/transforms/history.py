@@ -1,4 +1,4 @@
-"""The environment's side of the history, and what networks see of it."""
+"""The history in environments, and its part in a network's observation."""
 
 from __future__ import annotations
 
@@ -19,21 +19,19 @@ from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_
 
 
 class ActionHistory(EnvTransform):
-    """Writes the history for the next decision after each step, and a cold one at resets.
+    """A transform that writes the history for the next decision after each step, and a cold one at resets.
 
-    It has no state, so it does the same in ``env.rollout``, collectors and batched environments, inside and
-    outside of workers, and per sub-environment when some of them reset. :mod:`warmprior.history` has the
-    layout.
+    It has no state, so it works in ``env.rollout``, collectors and batched environments, inside and outside
+    workers, and when only some sub-environments reset. :mod:`warmprior.history` describes the layout.
 
     Args:
-        history_length: how many executed actions are remembered, usually ``H``.
+        history_length: number of executed actions that are remembered, usually ``H``.
         chunk_key: key of the executed chunk.
-        history_key: where the history is written; with keys of their own, several policies share an
-            environment.
+        history_key: where the history is written. Policies that share an environment need different keys.
 
     Raises:
         ValueError: if ``history_length < 1``.
-        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the history.
+        KeyError: if :class:`ChunkStep` does not precede it, or a step's input lacks the history.
 
     Examples:
         >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -59,7 +57,7 @@ class ActionHistory(EnvTransform):
         self._chunk: TensorSpec | None = None
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Forget the environment that this one, or what it was cloned from, was in."""
+        """Set the container, and forget the action spec of the environment before."""
         super().set_container(container)
         self._chunk = None
 
@@ -67,25 +65,25 @@ class ActionHistory(EnvTransform):
         history = tensordict.get(self.history_key, None)
         if history is None:
             raise KeyError(
-                f"ActionHistory found no {self.history_key!r} in a step's input: hand over what the reset or "
-                "the step before gave, with the chunk"
+                f"ActionHistory found no {self.history_key!r} in a step's input: add the chunk to the "
+                "tensordict of the last reset or step, and step with that"
             )
         executed = next_tensordict.get(keys.EXECUTED)
         if executed is None:
             raise KeyError(
                 f"ActionHistory found no {keys.EXECUTED!r} after the step: append it after ChunkStep"
             )
-        if history.ndim > next_tensordict.ndim:  # agents of a group, which execute alike
+        if history.ndim > next_tensordict.ndim:  # agents of a group, which execute equally many steps
             executed = expand_as_right(executed.squeeze(-1), history["steps"])
         moved = advance(history, tensordict.get(self.in_keys[0]), executed)
         next_tensordict.set(self.history_key, moved)
-        # The others' chunks were not executed.
+        # Rows that were not stepped have executed nothing.
         next_tensordict = keep_resting(tensordict, next_tensordict, self.out_keys)
         self._remember_ends(next_tensordict, [self.history_key])
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
+        # Written to all rows: TorchRL keeps those of the sub-environments that were reset.
         chunk = self._chunk or self._check_chunk()
         return tensordict_reset.set(self.history_key, self._cold(chunk, tensordict_reset))
 
@@ -116,7 +114,7 @@ class ActionHistory(EnvTransform):
 
 
 class WithheldHistory(Transform):
-    """Withholds the history of some training windows, so that the network also learns the cold start.
+    """A transform that withholds the history of some training windows, to teach the network cold starts.
 
     Append it to a replay buffer (``withhold`` of :func:`~warmprior.window_replay_buffer`). The paper's
     Algorithm 1 withholds nothing.
@@ -156,7 +154,7 @@ class WithheldHistory(Transform):
         if tensordict.get(keys.CONDITIONED, None) is not None:
             raise ValueError(
                 "the history is in the observation already: put WithheldHistory before HistoryObservation, "
-                "or take withhold= of window_replay_buffer"
+                "or use the argument withhold= of window_replay_buffer"
             )
         device = history["actions"].device
         draw = torch.rand(history.batch_size, generator=self.generator, device=device)
@@ -164,16 +162,17 @@ class WithheldHistory(Transform):
 
 
 class HistoryObservation(EnvTransform):
-    """Appends the last ``H`` actions to the observation, in environments and replay buffers alike.
+    """A transform that appends the last ``H`` actions to the observation, in environments and replay buffers.
 
-    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``: the actions, flattened (zero until there
-    are ``H`` of them), and whether there are ``H``, repeated over the observation steps. Build the network
-    with ``observation_dim = d_o + HistoryObservation.width(H, d_a)`` and the policy with
-    ``observation_key=keys.CONDITIONED``. In an environment it comes after :class:`~warmprior.ActionHistory`.
+    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``: the flattened actions (zero until there
+    are ``H``) and a flag that is 1 once there are ``H``, repeated over the observation steps. Build the
+    network with ``observation_dim = d_o + HistoryObservation.width(H, d_a)`` and the policy with
+    ``observation_key=keys.CONDITIONED``. In an environment, append it after
+    :class:`~warmprior.ActionHistory`.
 
     Args:
-        observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
-            vector ``"state"`` is extended.
+        observation_key: key of the observation, ``[*B, To, d_o]``; if it has several entries, such as images,
+            the vector ``"state"`` is extended.
         history_key: key of the history.
 
     Raises:
@@ -185,7 +184,7 @@ class HistoryObservation(EnvTransform):
         >>> from warmprior import GaussianPrior, HistoryObservation, policy_transforms
         >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
-        >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether there are 2
+        >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, and the flag
         >>> seen.shape, seen[:, 0, -1].tolist(), 3 + HistoryObservation.width(2, action_dim=1)
         (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
     """
@@ -198,15 +197,15 @@ class HistoryObservation(EnvTransform):
 
     @staticmethod
     def width(history_length: int, action_dim: int) -> int:
-        """How much wider the observation becomes: ``H * d_a + 1``."""
+        """Return the number of entries added to the observation, ``H * d_a + 1``."""
         return history_length * action_dim + 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the extended observation."""
         observation, actions, steps = self._read(tensordict)
-        known = steps >= actions.shape[-2]
-        seen = torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2)
-        context = torch.cat([seen, known.to(seen)], dim=-1).unsqueeze(-2)
+        full = steps >= actions.shape[-2]
+        flat = torch.where(full.unsqueeze(-1), actions, 0.0).flatten(-2)
+        context = torch.cat([flat, full.to(flat)], dim=-1).unsqueeze(-2)
 
         def extend(vector: Tensor) -> Tensor:
             added = context.expand(*vector.shape[:-1], context.shape[-1]).to(vector.dtype)
@@ -215,7 +214,7 @@ class HistoryObservation(EnvTransform):
         return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
-        """The values or specs under the input keys."""
+        """Return the values or specs under the input keys."""
         check_keys(
             place, self.in_keys, "HistoryObservation", ". In an environment append it after ActionHistory"
         )
@@ -238,7 +237,7 @@ class HistoryObservation(EnvTransform):
 
 
 def _with_vector(observation: Any, extend: Any) -> Any:
-    """An observation or its spec, a vector or several entries, with its vector extended."""
+    """Extend the vector of an observation or of its spec, which may have several entries."""
     if not isinstance(observation, TensorDictBase | Composite):
         return extend(observation)
     if keys.STATE not in observation.keys():  # noqa: SIM118

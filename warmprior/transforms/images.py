@@ -1,4 +1,4 @@
-"""Images of a simulator's cameras, and features of a frozen encoder in their place."""
+"""Images from a simulator's cameras, and features from a frozen encoder that replace them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _SIM_STATE = ": build the environment with sim_state=True"
 
 
 class CameraImages(EnvTransform):
-    """Adds an image per camera to an observation vector.
+    """A transform that adds one image per camera to an observation vector.
 
-    The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``), which takes
-    several times as long as a control step, so only the observations that the next decision reads are
-    rendered. Place it first, next to the simulator, and inside the workers of batched environments
+    The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``). Rendering
+    takes several times as long as a control step, so only the observations that the next decision reads are
+    rendered. Append it directly to the simulator, inside the workers of batched environments
     (:func:`policy_transforms` does so).
 
     Args:
@@ -37,7 +37,7 @@ class CameraImages(EnvTransform):
     Raises:
         ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
         KeyError: if the environment does not write its state.
-        RuntimeError: if it is no simulator, or nothing here can render.
+        RuntimeError: if the environment is not a simulator, or this machine cannot render.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -65,7 +65,7 @@ class CameraImages(EnvTransform):
         base: Any = None if self.container is None else self.container.base_env
         if not hasattr(base, "render_frame"):
             raise RuntimeError(
-                "CameraImages renders a simulator: append it to TransformedEnv(RobosuiteEnv(...)), inside of "
+                "CameraImages renders a simulator: append it to TransformedEnv(RobosuiteEnv(...)), inside "
                 f"batched environments, not to {type(base).__name__}"
             )
         return base
@@ -81,7 +81,7 @@ class CameraImages(EnvTransform):
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Replace the vector by the vector and images."""
+        """Replace the vector by entries for the vector and the images."""
         check_keys(observation_spec, [keys.SIM_STATE], "CameraImages", _SIM_STATE)
         vector, shape = observation_spec[keys.OBSERVATION], (3, self.size, self.size)
         image = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=vector.device)
@@ -91,15 +91,15 @@ class CameraImages(EnvTransform):
 
 
 class EncodeObservation(EnvTransform):
-    """Writes the features ``[*B, To, d_o]`` that a frozen policy's encoder extracts from images.
+    """A transform that writes the features ``[*B, To, d_o]`` of a frozen policy's image encoder.
 
     Agents in the policy's source space and their critics read the features, so the encoder runs once per
-    decision and replay buffers hold vectors. The policy behind the agent reads them too:
-    ``actor.replace(observation_key=keys.FEATURES)``. Append it after :func:`policy_transforms`, and outside
-    batched environments: inside, every worker would hold a copy of the encoder.
+    decision and replay buffers hold vectors. Let the policy read them too:
+    ``actor.replace(observation_key=keys.FEATURES)``. Append it after :func:`policy_transforms`, outside
+    batched environments, because inside every worker would hold a copy of the encoder.
 
     Args:
-        actor: the policy; its network is copied and stays as it is.
+        actor: the policy; its network is copied, and not trained further.
 
     Raises:
         ValueError: if the network has no encoder (:attr:`VelocityNetwork.encodes`).
@@ -122,13 +122,11 @@ class EncodeObservation(EnvTransform):
         observation_key = unravel_key(actor.observation_key)
         super().__init__(in_keys=[observation_key], out_keys=[keys.FEATURES])
         if not getattr(actor.network, "encodes", False):
-            raise ValueError(
-                f"{type(actor.network).__name__} takes observations as they are: there is nothing to encode"
-            )
+            raise ValueError(f"{type(actor.network).__name__} has no encoder: leave EncodeObservation out")
         self.network = copy.deepcopy(actor.network).eval().requires_grad_(False)
 
     def train(self, mode: bool = True) -> EncodeObservation:
-        """Stays in evaluation mode."""
+        """Stay in evaluation mode."""
         return super().train(False)
 
     @torch.no_grad()
@@ -137,8 +135,7 @@ class EncodeObservation(EnvTransform):
         check_keys(tensordict, self.in_keys, "EncodeObservation")
         observation = tensordict.get(self.in_keys[0])
         batch, device = tensordict.batch_size, next(self.network.parameters()).device
-        seen = network_observation(observation, batch)
-        features = encoded(self.network, seen.to(device))
+        features = encoded(self.network, network_observation(observation, batch).to(device))
         assert isinstance(features, torch.Tensor)
         features = features.reshape(*batch, *features.shape[1:])
         return tensordict.set(self.out_keys[0], features.to(tensordict.device or device))

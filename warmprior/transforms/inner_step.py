@@ -1,4 +1,4 @@
-"""A step of the environment below a transform, through the transforms that its container already holds."""
+"""A step of the environment below a transform, through the transforms between the two."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 from warmprior.transforms.restarts import NATIVE, Restarts
 
 KEPT = "_kept"
-"""Where :func:`set_aside` puts observations, at the root of a step's input."""
+"""The key of observations that :func:`set_aside` keeps, at the root of a step's input."""
 
 
 def check_unwritten(observation_spec: Any, names: Iterable[NestedKey], whose: str) -> None:
-    """Raise ValueError if something before a transform writes what it is about to write."""
+    """Raise ValueError if the environment already writes a key that a transform would write."""
     present = observation_spec.keys(True, True)
     if taken := [name for name in names if name in present]:
-        raise ValueError(f"{whose} would overwrite {taken}: each needs keys of its own in one environment")
+        raise ValueError(f"{whose} would overwrite {taken}: give each in an environment its own keys")
 
 
 class EnvTransform(Transform):
-    """A transform that writes the same after a reset as after a step, and nothing outside environments."""
+    """A transform that treats resets like steps, and does nothing outside environments."""
 
     _ends: TensorDictBase | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Does nothing: what the transform writes is already in data, or not needed there."""
+        """Do nothing: data already hold the transform's entries, or do not need them."""
         return tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # For all sub-environments: TorchRL keeps the rows of those that were reset.
+        # Written to all rows: TorchRL keeps those of the sub-environments that were reset.
         return self._call(tensordict_reset)
 
     def _reset_on_native_autoreset(
@@ -47,11 +47,11 @@ class EnvTransform(Transform):
         return rows_where(rows, fresh, tensordict_reset)
 
     def _as_reset(self, stepped: TensorDictBase) -> TensorDictBase:
-        """Return what a reset would give to this transform, from what its step has made of it."""
+        """Return a reset's input to this transform, recovered from the result of its step."""
         return stepped
 
     def _remember_ends(self, next_tensordict: TensorDictBase, names: Iterable[NestedKey]) -> None:
-        """Remember what was written: with native autoresets TorchRL blanks all observations of an end."""
+        """Remember this transform's entries: with native autoresets TorchRL blanks observations at an end."""
         if self.parent.__dict__.get(NATIVE, False):
             self._ends = next_tensordict.select(*names, strict=False).copy()
 
@@ -65,10 +65,10 @@ class EnvTransform(Transform):
 
 
 class InnerStep:
-    """Steps the environment that a transform sees below itself, through the container's own transforms.
+    """A step of the environment below a transform, through the container's own transforms.
 
-    ``Transform.parent`` is that environment too, but around *copies*: what they count or record would be
-    lost.
+    ``Transform.parent`` is the same environment, but with *copies* of the transforms, whose counts and
+    records would be lost.
     """
 
     def __init__(self, transform: Transform) -> None:
@@ -97,7 +97,7 @@ class InnerStep:
     def __call__(
         self, tensordict: TensorDictBase, rows: Tensor | None = None, last: bool = False
     ) -> TensorDictBase:
-        """Take the step of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined.
+        """Step all rows, or those in ``rows``, bool ``[*B]``; results of the other rows are undefined.
 
         After the ``last`` step of a decision, rows that a simulator has restarted show a fresh reset.
         """
@@ -122,28 +122,28 @@ class InnerStep:
         return result
 
     def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The result of a step ``[*B]`` of the environment itself, with all its flags."""
+        """Return the result of a step ``[*B]`` of the environment itself, with all its flags."""
         # Cloned, because an environment may write the next one into the same memory.
         result = self.base._step(tensordict).clone()
-        found = dict(result.items())  # several times faster to ask
+        entries = dict(result.items())  # several times faster to look up
         for key, shape in self._done_shapes:
-            done = found.get(key) if isinstance(key, str) else result.get(key, None)
+            done = entries.get(key) if isinstance(key, str) else result.get(key, None)
             if done is None or done.shape != shape:
-                # Only then: most environments give all flags, and completing them is slow.
+                # Only if one is missing: most environments return all flags, and completing them is slow.
                 self.base._complete_done(self._done_spec, result)
                 break
         return result
 
 
 def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:
-    """Keep observations, under :data:`KEPT`, from a batched environment that takes a partial step.
+    """Move observations to :data:`KEPT` during a partial step of a batched environment.
 
-    For the rows that it leaves out it returns what it finds in the step's input, and fails, or casts
-    silently, if a transform gave that another shape or dtype.
+    For rows that it does not step, the environment returns the entries of the step's input, and fails, or
+    casts silently, if a transform has changed their shape or dtype.
     """
     rows, kept = tensordict.get("_step", None), tensordict.get(KEPT, None)
     if rows is None or not rows.any():
-        return  # all step, or none: then TorchRL copies what it finds
+        return  # all rows step, or none, and then TorchRL copies the input
     if kept is None:
         kept = tensordict.empty()
         tensordict.set(KEPT, kept)
@@ -158,21 +158,21 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
 def keep_resting(
     tensordict: TensorDictBase, next_tensordict: TensorDictBase, names: Iterable[NestedKey]
 ) -> TensorDictBase:
-    """After a partial step, restore what a transform wrote in the rows that were not stepped, in place."""
+    """Restore a transform's entries in the rows that a partial step has left out, in place."""
     rows = tensordict.get("_step", None)
     for name in names if rows is not None else ():
         before, after = tensordict[name], next_tensordict[name]
-        asked = expand_as_right(rows.view(next_tensordict.batch_size), after)
-        next_tensordict.set(name, torch.where(asked, after, before))
+        stepped = expand_as_right(rows.view(next_tensordict.batch_size), after)
+        next_tensordict.set(name, torch.where(stepped, after, before))
     return next_tensordict
 
 
 def rows_where(
     mask: Tensor, new: TensorDictBase, old: TensorDictBase, but: Container[NestedKey] = ()
 ) -> TensorDictBase:
-    """``new``, with the rows of ``old`` where ``mask`` ``[*B]`` does not hold and ``old`` has the key.
+    """Return ``new``, with rows from ``old`` where ``mask`` ``[*B]`` is False and ``old`` has the key.
 
-    Entries ``but`` some, which stay those of ``new``.
+    Entries in ``but`` stay those of ``new``.
     """
     result = new.copy()
     for key in new.keys(True, True, is_leaf=is_leaf_nontensor):
@@ -185,6 +185,6 @@ def rows_where(
 
 
 def _container(transform: Transform) -> EnvBase | Compose | None:
-    # TorchRL's own `container` skips to the environment, but what comes before is listed on the way.
+    # TorchRL's own `container` skips to the environment, past the Compose that lists earlier transforms.
     reference = transform.__dict__.get("_container")
     return None if reference is None else reference()

@@ -35,34 +35,35 @@ def policy_transforms(
     success: NestedKey = keys.SUCCESS,
     measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
 ) -> Compose:
-    """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
+    """Return the transforms between an environment and a :class:`~warmprior.WarmPriorActor`.
 
-    In this order: conversion of actions to the environment's own, camera images, (de)normalisation, a stack
-    of the last ``To`` observations, :class:`ChunkStep`, :class:`ActionHistory`, and on request
-    :class:`HistoryObservation` and :class:`InferenceDelay`. It works around a single environment, and inside
-    or outside of batched ones (with images, inside).
+    They convert actions to the environment's own, add camera images, (de)normalise, stack the last ``To``
+    observations, execute chunks (:class:`ChunkStep`), write the history (:class:`ActionHistory`), and on
+    request show it to the network (:class:`HistoryObservation`) and delay chunks (:class:`InferenceDelay`),
+    in this order. They work around a single environment, and inside or outside batched ones (with images,
+    inside only).
 
     Args:
-        policy: the policy; or its prior, of which only the lengths matter.
-        normalizer: the normaliser of the training data; the policy's by default. Give the policy's prior in
-            place of the policy if the environment is normalised already.
-        actions: converts the policy's actions, in raw units, to the environment's, such as
-            :class:`AbsoluteActions`; a copy of it is used.
-        images: adds images to observations, such as :class:`CameraImages`; a copy of it is used.
-        observation_steps: ``To``; those of the policy's network by default, or 2.
+        policy: the policy, or its prior, of which only the lengths matter.
+        normalizer: the normaliser of the training data; the policy's by default. Pass the policy's prior
+            instead of the policy if the environment is already normalised.
+        actions: transform that converts the policy's actions, in raw units, to the environment's, such as
+            :class:`AbsoluteActions`; it is copied.
+        images: transform that adds images to observations, such as :class:`CameraImages`; it is copied.
+        observation_steps: ``To``; by default that of the policy's network, or 2.
         execute: actions executed per decision; by default ``H``, or with a ``delay`` as many as predictions
             allow.
-        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 for a
-            policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
+        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 if the
+            policy has :class:`~warmprior.RealTimeChunking`; otherwise no delay is written.
         gamma: discount per control step inside a chunk.
-        see_history: whether the network sees the last actions; as in the policy by default.
-        observation_key: the policy's by default, as are the keys of history and chunk.
-        action_key: the environment's action.
+        see_history: True if the network sees the last actions; by default as in the policy.
+        observation_key: key of the observation; by default the policy's, like the keys of history and chunk.
+        action_key: key of the environment's action.
         success: see :class:`ChunkStep`.
         measures: see :class:`ChunkStep`.
 
     Raises:
-        TypeError: for anything else than a policy or a prior.
+        TypeError: if ``policy`` is neither a policy nor a prior.
         ValueError: if the normaliser lacks the action, or numbers do not fit each other.
 
     Examples:
@@ -78,14 +79,14 @@ def policy_transforms(
     if isinstance(policy, WarmPriorActor):
         prior, observed = policy.prior, policy.observation_key
         history_key, chunk_key = policy.history_key, policy.tensor_keys["chunk_key"]
-        sees_history = policy.sees_history  # made of the observation under its usual key
+        sees_history = policy.sees_history  # then the stack writes the observation under its default key
         normalizer = normalizer or policy.normalizer
         observation_key = observation_key or (None if sees_history else observed)
         see_history = sees_history if see_history is None else see_history
         if observation_steps is None:
             observation_steps = getattr(uncompiled(policy.network), "observation_steps", None)
         if delay is None and policy.ode.guidance is not None:
-            delay = 0  # guidance reads the rest of the chunk before
+            delay = 0  # guidance reads the delay's key
     if not isinstance(prior, Prior):
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps

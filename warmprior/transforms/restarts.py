@@ -1,4 +1,4 @@
-"""Simulators that restart rows by themselves, or must be told to, while other rows go on with their chunk."""
+"""Resets of rows whose episode has ended while other rows go on with their chunk."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from torchrl.envs.transforms import (
 )
 
 NATIVE = "_torchrl_native_autoreset"
-"""TorchRL's mark of an environment whose steps show the next episode's first observation at an end."""
+"""TorchRL's name of environments whose steps return the next episode's first observation at an end."""
 
 
 _BY_THEMSELVES = (AutoResetTransform, VecGymEnvTransform)
 
 
 class Restarts:
-    """What a batch of environments does with rows whose episode has ended, while the others go on.
+    """The restarts of rows whose episode has ended, while the other rows of a batch go on.
 
-    Most rest, or run on without effect, until TorchRL resets them. Others restart these rows by themselves,
-    and would play the rest of a chunk in the next episode.
+    Most environments leave these rows idle, or step them without effect, until TorchRL resets them. Some
+    restart these rows by themselves, and would execute the rest of a chunk in the next episode.
 
     Args:
         container: the environment that steps and resets.
-        transforms: those of its transforms that belong to a step.
+        transforms: the transforms that belong to a step.
 
     Attributes:
-        native: the simulator restarts rows, and resets single ones on request (Isaac Lab, mjlab): they get a
-            fresh reset after the last step of a decision.
-        needed: the simulator refuses to step rows that have ended (``AutoresetMode.DISABLED`` of Gymnasium):
-            they get a reset before every further step.
+        native: True if the simulator restarts rows, and resets single ones on request (Isaac Lab, mjlab):
+            such rows get a fresh reset after the last step of a decision.
+        needed: True if the simulator refuses to step rows that have ended (Gymnasium's
+            ``AutoresetMode.DISABLED``): such rows get a reset before every further step.
     """
 
     def __init__(self, container: TransformedEnv, transforms: Sequence[Transform]) -> None:
@@ -70,9 +70,9 @@ class Restarts:
             )
         if self._alone and execute > 1:
             raise RuntimeError(
-                "this environment restarts a row in the step that ends its episode, and the rest of a chunk "
-                f"would be played in the next one: use execute=1, not {execute}, or an environment that "
-                f"TorchRL resets (SerialEnv, ParallelEnv; of Gymnasium: {vector})"
+                "this environment restarts a row in the step that ends its episode, so the rest of a chunk "
+                f"would be executed in the next one: use execute=1, not {execute}, or an environment that "
+                f"TorchRL resets (SerialEnv, ParallelEnv; for Gymnasium: {vector})"
             )
 
     def rows(self, ended: Tensor) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""The last observations, stacked without state."""
+"""A stack of the last observations, without state."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
 
 class ObservationStack(EnvTransform):
-    """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.
+    """A transform that replaces the observation ``[*B, d_o]`` by the last ``To``, ``[*B, To, d_o]``.
 
-    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation.
+    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``; every entry of a nested observation is stacked.
     After a reset the first observation is repeated. Unlike :class:`~torchrl.envs.transforms.CatFrames` it
-    keeps no buffer: older observations come from the step's own tensordict. So it is right inside and outside
-    batched environments, and when only some sub-environments reset or step.
+    keeps no buffer: older observations come from the step's own tensordict. So it is correct inside and
+    outside batched environments, and when only some sub-environments reset or step.
 
     Args:
         steps: ``To``.
-        observation_key: key of the observation, in and out; or of several, nested under it.
+        observation_key: key of the observation, in and out, or of entries nested under it.
 
     Raises:
         ValueError: if ``steps < 1``.
-        KeyError: if the environment has no such observation, or (on a step) the tensordict no current stack.
+        KeyError: if the environment has no such observation, or (on a step) the input has no stack yet.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -58,7 +58,7 @@ class ObservationStack(EnvTransform):
         if stack is None:
             raise KeyError(
                 f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
-                "what reset or step_mdp returned"
+                "the tensordict that reset or step_mdp returned"
             )
         return stack
 
@@ -82,7 +82,7 @@ class ObservationStack(EnvTransform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._check_key(tensordict_reset)
         time = self._time(tensordict_reset)
-        # Rows that were not reset keep their stack: TorchRL merges only the others.
+        # Rows that were not reset keep their stack, because TorchRL merges only the others.
         stack = _each(
             lambda first: torch.stack([first] * self.steps, dim=time),
             tensordict_reset.get(self.observation_key),
@@ -96,7 +96,7 @@ class ObservationStack(EnvTransform):
         return stepped.set(self.observation_key, newest)
 
     def _time(self, place: TensorDictBase | Composite) -> int:
-        """Return the stack's dimension: behind those of the batch, and of a group's agents."""
+        """Return the index of the stack's dimension, after those of the batch and of a group's agents."""
         if isinstance(self.observation_key, tuple):
             place = place[unravel_key(self.observation_key[:-1])]
         return place.ndim
@@ -131,7 +131,7 @@ class ObservationStack(EnvTransform):
 def _each(
     function: Callable[..., Tensor], value: Tensor | TensorDictBase, *others: Tensor | TensorDictBase
 ) -> Tensor | TensorDictBase:
-    """Apply a function to an observation, or to every entry of one that has several."""
+    """Apply a function to an observation, or to each of its entries."""
     if isinstance(value, TensorDictBase):
         return value.apply(function, *others)
     return function(value, *others)

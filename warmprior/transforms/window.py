@@ -1,4 +1,4 @@
-"""Training windows, gathered on sample from contiguous demonstrations."""
+"""Training windows, gathered from contiguous demonstrations when a buffer is sampled."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
 
 class ActionWindow(Transform):
-    """Replaces sampled steps by training windows with the history before them.
+    """A transform that replaces sampled steps by training windows with the history before them.
 
     For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations (the
     episode's first one repeated at the start), the target chunk ``[i, i+P)`` (the episode's last action
     repeated past its end, and marked in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the
-    actions before, and the target's first ``P - H`` as a forecast. Windows never cross episode borders. One
-    buffer serves all priors of its lengths.
+    actions before step ``i``, and the target's first ``P - H`` actions as a forecast. Windows never cross
+    episode borders. One buffer serves all priors with the same lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
@@ -32,7 +32,7 @@ class ActionWindow(Transform):
             An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
         chunk_length: ``H``.
         prediction_length: ``P``; ``H`` by default.
-        history_length: how many executed actions are remembered; ``H`` by default, and at least.
+        history_length: number of executed actions that are remembered, at least ``H``, the default.
         observation_steps: ``To``.
         observation_key: key of the observation, in ``data`` and in windows.
 
@@ -40,7 +40,7 @@ class ActionWindow(Transform):
         KeyError: if ``data`` lacks a key.
         ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
             not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
-        IndexError: (on a call) for a step that the data do not hold.
+        IndexError: (on a call) if the data do not hold a step.
 
     Examples:
         >>> import torch
@@ -78,8 +78,8 @@ class ActionWindow(Transform):
         prediction_length = chunk_length if prediction_length is None else prediction_length
         history_length = chunk_length if history_length is None else history_length
         if not 1 <= chunk_length <= min(prediction_length, history_length):
-            given = f"{chunk_length}, {prediction_length} and {history_length}"
-            raise ValueError(f"need 1 <= chunk_length <= prediction_length and history_length, got {given}")
+            lengths = f"{chunk_length}, {prediction_length} and {history_length}"
+            raise ValueError(f"need 1 <= chunk_length <= prediction_length and history_length, got {lengths}")
         self.chunk_length, self.history_length = chunk_length, history_length
         observations, action, episode = _checked(data, observation_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
@@ -100,7 +100,7 @@ class ActionWindow(Transform):
         if frame is None:
             raise KeyError(f"ActionWindow needs steps at {keys.FRAME!r}: see window_replay_buffer")
         if frame.dtype not in (torch.int64, torch.int32):
-            raise ValueError(f"{keys.FRAME!r} numbers steps, as int64, and is {frame.dtype}")
+            raise ValueError(f"{keys.FRAME!r} holds step numbers and must be int64, got {frame.dtype}")
         batch, before = tensordict.batch_size, self.history_length
         frame = frame.reshape(-1, 1)
         try:
@@ -112,7 +112,7 @@ class ActionWindow(Transform):
         is_pad = index[:, before:] > end
         action = _rows(self.action, index.clamp(start, end))
         target = action[:, before:]
-        # Outside the episode the gather repeats its first action, which belongs to the target: zero it.
+        # Before the episode the gather repeats its first action, which belongs to the target: zero it.
         executed = action[:, :before] * (index[:, :before] >= start).unsqueeze(-1)
         history = window_history(executed, frame - start, target, self.chunk_length)
         recent = (frame + self.observation_offsets).clamp_min(start)
@@ -124,16 +124,16 @@ class ActionWindow(Transform):
 
 
 def _rows(values: Tensor, index: Tensor) -> Tensor:
-    """``values[index]``, along the first dimension."""
-    # Selected and not indexed, from a plain tensor: twice as fast, and for images thirty times.
-    found = values.as_subclass(Tensor).index_select(0, index.flatten())
-    return found.view(*index.shape, *values.shape[1:])
+    """Return ``values[index]``, along the first dimension."""
+    # index_select of a plain tensor is twice as fast as indexing, and for images thirty times.
+    rows = values.as_subclass(Tensor).index_select(0, index.flatten())
+    return rows.view(*index.shape, *values.shape[1:])
 
 
 def _checked(
     data: TensorDictBase, observation_key: NestedKey
 ) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
-    """The entries of the observation, the action and the episode numbers."""
+    """Check the data, and return the observation's entries, the action and the episode numbers."""
     entries = []
     for key in (observation_key, keys.ACTION, keys.EPISODE):
         value = data.get(key, None)
@@ -164,7 +164,7 @@ def _checked(
 
 
 def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last step of every step's episode, each ``[N]``."""
+    """Return the first and the last step of every step's episode, each ``[N]``."""
     values, lengths = torch.unique_consecutive(episode, return_counts=True)
     if len(values.unique()) != len(values):
         repeated = values.sort().values
@@ -185,18 +185,18 @@ def window_transforms(
     generator: torch.Generator | None = None,
     observation_key: NestedKey = keys.OBSERVATION,
 ) -> Compose:
-    """Transforms that turn step numbers into the windows that a policy reads.
+    """Return transforms that turn step numbers into the windows that a policy reads.
 
-    :class:`ActionWindow`, and on request :class:`~warmprior.WithheldHistory` and
+    They are :class:`ActionWindow`, and on request :class:`~warmprior.WithheldHistory` and
     :class:`~warmprior.HistoryObservation`: the counterpart of :func:`~warmprior.policy_transforms` for data.
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
         prior: the policy's prior, of which only the lengths matter.
         observation_steps: ``To``.
-        see_history: whether the network sees the last actions.
+        see_history: True if the network sees the last actions.
         withhold: share of the windows whose history is withheld.
-        generator: source of randomness of the withheld windows, on the data's device.
+        generator: chooses the withheld windows, on the data's device.
         observation_key: see :class:`ActionWindow`.
 
     Examples:
@@ -238,23 +238,23 @@ def window_replay_buffer(
     generator: torch.Generator | None = None,
     observation_key: NestedKey = keys.OBSERVATION,
 ) -> TensorDictReplayBuffer:
-    """A replay buffer that samples training windows from demonstrations.
+    """Return a replay buffer that samples training windows from demonstrations.
 
-    It stores only the step numbers; :class:`ActionWindow` gathers the rest, which is faster than reading
-    whole steps.
+    It stores only step numbers; :class:`ActionWindow` gathers the windows, which is faster than reading whole
+    steps.
 
     Args:
         data: contiguous normalised steps ``[N]``, see :class:`ActionWindow`.
         prior: the policy's prior, of which only the lengths matter.
         batch_size: windows per sample.
         observation_steps: ``To``.
-        see_history: whether the network sees the last actions.
+        see_history: True if the network sees the last actions.
         withhold: share of the windows whose history is withheld.
-        generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
-        observation_key: of the observation.
+        generator: chooses the windows, and those withheld; PyTorch's global generator by default.
+        observation_key: key of the observation.
 
     Raises:
-        ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
+        ValueError: if ``batch_size < 1``, or for the reasons of :class:`ActionWindow`.
 
     Examples:
         >>> from warmprior import PreviewPrior, window_replay_buffer
@@ -276,7 +276,7 @@ def window_replay_buffer(
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
-        # The sampler draws on the storage's device, where the generator has to be too.
+        # The sampler draws on the storage's device, where the generator must be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
         sampler=RandomSampler(),
         writer=ImmutableDatasetWriter(),
@@ -287,7 +287,7 @@ def window_replay_buffer(
 
 
 def without_images(data: TensorDictBase) -> TensorDictBase:
-    """Steps without images, which would fill the memory in thousands of windows."""
+    """Return steps without images, which would fill the memory in thousands of windows."""
     observation = data.get(keys.OBSERVATION)
     if not isinstance(observation, TensorDictBase) or keys.STATE not in observation:
         return data
