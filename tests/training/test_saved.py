@@ -165,7 +165,7 @@ def test_missing_files(tmp_path):
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*, and this version reads 7"):
+    with pytest.raises(ValueError, match=r"has format .*this version reads 7"):
         load_policy(tmp_path)
 
 
@@ -212,7 +212,7 @@ def test_a_policy_that_is_loaded_is_finite(tmp_path, name, value):
     if name == WEIGHT and math.isfinite(value):
         load_policy(tmp_path)
         return
-    with pytest.raises(ValueError, match=f"the policy at {tmp_path} .*: {name} holds"):
+    with pytest.raises(ValueError, match=f"the policy at {tmp_path} .*: {name} "):
         load_policy(tmp_path)
 
 
@@ -252,7 +252,7 @@ def test_a_copy_of_the_configuration_that_differs_is_reported(tmp_path):
     actor = saved(tmp_path)
     copy = tmp_path / "config.json"
     copy.write_text(copy.read_text().replace("0.125", "0.5"))
-    with pytest.warns(UserWarning, match=r"config\.json differs in prior from model\.safetensors"):
+    with pytest.warns(UserWarning, match=r"config\.json differs in prior from .*model\.safetensors"):
         again = load_policy(tmp_path)
     assert again.prior.sigma == actor.prior.sigma == 0.125
     copy.unlink()

@@ -87,7 +87,7 @@ def test_a_folder_is_a_folder(hub, actor, tmp_path):
     for name in ("missing", "a/b/c", "../someone", f"{tmp_path}/missing", tmp_path / "missing"):
         with pytest.raises(FileNotFoundError, match="no policy at"):
             load_policy(name)
-    with pytest.raises(ValueError, match=r"is no repository at the hub: leave out revision='main'"):
+    with pytest.raises(ValueError, match=r"leave out revision='main'"):
         load_policy(NAME, revision="main")
     assert not hub.requests
 
@@ -101,6 +101,6 @@ def test_what_is_to_be_private_is_not_published(hub, actor):
 
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
-    with pytest.raises(ValueError, match=r"config\.json is of no policy of warmprior"):
+    with pytest.raises(ValueError, match=r"config\.json .*policy of warmprior"):
         load_policy(NAME)
     assert not [r for r in hub.requests if r.endswith("model.safetensors")]

@@ -60,7 +60,7 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
         ("own", {"episode": None}, KeyError, r"demonstrations of own.*missing: \['episode'\]"),
         ("own", {"action": torch.zeros(40)}, ValueError, r"'action' of own has shape \(40,\)"),
         ("own", {"observation": torch.full((40, 3), math.nan)}, ValueError, "NaN|finite"),
-        ("../own", {}, ValueError, "become names of files: '../own' cannot"),
+        ("../own", {}, ValueError, r"file names.*'../own'"),
     ],
 )
 def test_data_that_cannot_be_are_named(name, changed, error, said):
@@ -152,11 +152,11 @@ def test_joint_targets_are_learnt_from_where_the_joints_are():
 @pytest.mark.parametrize(
     ("columns", "said"),
     [
-        ([1, 2, -1], r"action [01] least \(number [12] of"),
-        ([0, 1, -1], r"action 0 least \(number 0 of"),
+        ([1, 2, -1], r"action [01] \(number [12] of"),
+        ([0, 1, -1], r"action 0 \(number 0 of"),
         ([2, 1], "3 numbers"),
         ([2, 3, -1], "from -1 to 2"),
-        ([-1, -1, -1], "not all of them -1"),
+        ([-1, -1, -1], "not all -1"),
         ([2, 1.5, -1], "column 1"),
     ],
 )
@@ -179,7 +179,7 @@ def test_joints_may_hang_below_their_targets():
     assert isinstance(task.rest, RestingJoints)
     for factor in (0.5, 57.3):  # other units
         other = action * torch.tensor([factor, factor, 1.0, 1.0])
-        with pytest.raises(ValueError, match="in the same order and units"):
+        with pytest.raises(ValueError, match="same order and units"):
             Task.of("arm", steps(400, observation=seen, action=other)).with_joints([2, 1, -1, -1])
 
 

@@ -40,27 +40,27 @@ from warmprior.training.saved import check_saveable, load_policy, save_policy
 from warmprior.transforms.window import window_replay_buffer
 
 WINDOWS_SEED = 1_000_003
-"""Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
+"""An offset of the seed of a separate window generator, so that it does not repeat the source's draws."""
 
 STATE_FORMAT = 7
-"""Part of every state's identity; raised whenever the same options give other weights."""
+"""A version in every state's identity; it is raised whenever the same options lead to other weights."""
 
 
 class BehaviourCloning:
-    """Trains a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
+    """A training of a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
 
-    The folder receives ``state.safetensors`` (what is needed to continue) and one policy of averaged weights
-    per checkpoint, ``policy_000250/`` and so on. The same training on a folder with a state continues it; on
-    CPU the result is bitwise that of an uninterrupted run with the same number of threads.
+    The folder receives ``state.safetensors`` (all that is needed to continue) and a policy with averaged
+    weights per checkpoint, ``policy_000250/`` and so on. The same training on a folder with a state continues
+    it; on a CPU the result is bitwise that of an uninterrupted run with the same number of threads.
 
     Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and runs the
-    same training and draws its own part of every batch, PyTorch's DDP averages the gradients, and the first
-    process alone writes.
+    same training and draws its own part of every batch, PyTorch's DDP averages the gradients, and only the
+    first process writes.
 
     Args:
         actor: the policy; its network is trained in place.
         data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; on the network's device,
-            or on the CPU where they do not fit there.
+            or on the CPU if they do not fit there.
         config: the recipe.
         directory: the folder.
 
@@ -68,9 +68,9 @@ class BehaviourCloning:
         observation_steps: ``To``.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
-        compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
-        prefetch: gather batches ahead in a thread, drawn by a generator of their own; always where data on
-            the CPU train a network that is not.
+        compile: True compiles the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
+        prefetch: True gathers batches ahead in a thread, drawn by a separate generator. This is always done
+            if the data are on the CPU and the network is not.
 
     Raises:
         ValueError: if a batch cannot be divided among the processes, the state is damaged or belongs to
@@ -105,7 +105,7 @@ class BehaviourCloning:
         compile: bool = False,
         prefetch: bool = False,
     ) -> None:
-        check_saveable(actor)  # before hours are spent on what would be lost
+        check_saveable(actor)  # before the training, whose result would be lost
         check_batch(config.batch_size)
         if actor.start is not None and any(p.requires_grad for p in actor.start.parameters()):
             raise ValueError(f"train {type(actor.start).__name__} before the flow, and freeze it")
@@ -119,9 +119,9 @@ class BehaviourCloning:
         self.generator = torch.Generator(device).manual_seed(config.seed)
         windows = self.generator
         prefetch = prefetch or home.type != device.type
-        if prefetch:  # what is drawn ahead cannot be drawn by the generator of what follows
+        if prefetch:  # a shared generator would be ahead of the losses by the prefetched draws
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
-        see_history = actor.sees_history  # made of the data's observation
+        see_history = actor.sees_history  # then windows extend the data's observation
         observation_key = OBSERVATION if see_history else actor.observation_key
         self.replay_buffer = window_replay_buffer(
             data,
@@ -149,28 +149,28 @@ class BehaviourCloning:
                 "observation_steps": observation_steps,
                 "clip": actor.sampling.clip,
                 "max_nfe": actor.sampling.max_nfe,
-                "normalizer": fixed_identity(actor.normalizer),  # data in other units may look alike
+                "normalizer": fixed_identity(actor.normalizer),  # data in other units may be equal
             },
             "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)
         self._differ()
-        self._restored: float | None = None  # when the state that was restored had been written
+        self._restored: float | None = None  # the time at which the restored state was written
         self._restore()
         if compile:
             self.update.compile()
 
     @property
     def state_path(self) -> Path:
-        """Where the training state lies."""
+        """The path of the training state."""
         return self.directory / "state.safetensors"
 
     def policy_path(self, iteration: int | None = None) -> Path:
-        """Where the policy kept after ``iteration`` lies, the last one by default."""
+        """Return the path of the policy kept after ``iteration``, by default the last one."""
         return policy_path(self.directory, self.config.iterations if iteration is None else iteration)
 
     def step(self) -> torch.Tensor:
-        """One gradient step; the loss of this process's part of the batch, a detached scalar."""
+        """Take a gradient step; return the loss of this process's part of the batch, a detached scalar."""
         loss = self.update(self._prefetch() if self._prefetch else self.replay_buffer.sample())
         self.iteration += 1
         return loss
@@ -187,8 +187,8 @@ class BehaviourCloning:
         if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
             return
         with exclusive(self.directory) if not self.rank else nullcontext():
-            from_leader(lambda: None)  # it has the lock
-            self._restore()  # what another process did since this object was built
+            from_leader(lambda: None)  # wait until the first process has locked the folder
+            self._restore()  # another process may have trained since this object was built
             if from_leader(lambda: self.iteration) != self.iteration:
                 raise OSError(f"processes read different states at {self.state_path}: share the directory")
             try:
@@ -238,16 +238,16 @@ class BehaviourCloning:
         save_policy(self.update.averaged(self.actor), self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
-        """Whether the policy of this iteration is on disk and whole."""
+        """Return True if the policy of this iteration is on disk and complete."""
         try:
-            with torch.random.fork_rng([]):  # a loaded policy was built with random weights before
+            with torch.random.fork_rng([]):  # loading a policy first draws random weights
                 load_policy(self.policy_path(self.iteration))
         except (OSError, ValueError):
             return False
         return True
 
     def _check_finite(self) -> None:
-        # Before every save and not only before logs: a saved NaN could not be resumed from.
+        # Checked before every save, and not only before logs: a training cannot resume from a saved NaN.
         losses = torch.stack(self._running)
         finite = bool(torch.isfinite(losses).all())
         if finite and all(bool(torch.isfinite(p).all()) for p in self.update.trained.parameters()):
@@ -274,7 +274,7 @@ class BehaviourCloning:
             try:
                 for name, value in values.items():
                     self.logger.log_scalar(name, value, step=self.iteration)
-            except OSError as error:  # which names no file: a full disk
+            except OSError as error:  # the error of a full disk names no file
                 place = getattr(self.logger, "log_dir", type(self.logger).__name__)
                 raise OSError(error.errno, f"cannot write the log: {error.strerror}", str(place)) from error
 
@@ -290,7 +290,7 @@ class BehaviourCloning:
         self._restored = self.state_path.stat().st_mtime
 
     def _differ(self) -> None:
-        """Draw apart from the other processes: windows, sources, times, dropout and crops."""
+        """Draw windows, sources, times, dropout and crops that differ from the other processes'."""
         if not self.rank:
             return
         torch.manual_seed(int(torch.randint(2**62, ())) + self.rank)
@@ -299,7 +299,7 @@ class BehaviourCloning:
             self._prefetch.restore(int(torch.randint(2**62, ())))
 
     def _restore(self) -> None:
-        """Continue from the folder's state, if there is one that is not continued already."""
+        """Continue from the folder's state, if it has one that is not restored already."""
         if not self.state_path.exists():
             return
         written = self.state_path.stat().st_mtime
@@ -318,12 +318,12 @@ class BehaviourCloning:
         self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
         if self._prefetch is not None:
-            # Where the data lay on the device before, windows were drawn by the generator of the rest.
+            # The state has no window generator if the data were on the device: there one generator draws all.
             seed = WINDOWS_SEED + self.config.seed + self.iteration
             self._prefetch.restore(tensors.get("rng/windows", seed))
         self._differ()
 
 
 def policy_path(directory: Path, iteration: int) -> Path:
-    """Where a training in ``directory`` keeps the policy of one iteration."""
+    """Return the folder of the policy that a training in ``directory`` keeps after an iteration."""
     return directory / f"policy_{iteration:06d}"

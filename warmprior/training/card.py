@@ -1,4 +1,4 @@
-"""The card of a policy that others are to use: what it is, how it was trained and what was measured of it."""
+"""The model card of a policy: its parts, its training and its measured success."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def model_card(
 
     Args:
         actor: the policy.
-        results: a row per way of playing it, with ``task``, ``data``, ``seed``, ``checkpoint``,
-            ``iterations``, ``nfe``, ``episodes``, ``successes``, and ``demonstrations``, facts of them.
+        results: a row per evaluation, with ``task``, ``data``, ``seed``, ``checkpoint``, ``iterations``,
+            ``nfe``, ``episodes``, ``successes``, and ``demonstrations``, facts about the data.
 
     Keyword Args:
-        repository: where the policy will lie.
+        repository: the repository that will hold the policy, such as ``"user/name"``.
         licence: the hub's name of its licence, such as ``"mit"``.
 
     Examples:
@@ -99,11 +99,11 @@ def _success(results: Sequence[Mapping[str, Any]]) -> str:
         cells = [str(row[name]) for name in (*conditions, "episodes", "successes")]
         shown.append([*cells, f"{100 * low:.1f}% to {100 * high:.1f}%"])
     words = (
-        "NFE is the number of network evaluations per chunk. The interval is of a Beta posterior under a "
-        "uniform prior: it says how few the episodes are, and not how training seeds differ."
+        "NFE is the number of network evaluations per chunk. The interval is from a Beta posterior under a "
+        "uniform prior: it reflects the number of episodes, but not the variation between training seeds."
     )
     if results[0].get("demonstrations", {}).get("source") == "scripted":
-        words += " A scripted expert recorded the data: do not set these beside published numbers."
+        words += " A scripted expert recorded the data: do not compare these with published numbers."
     return f"{_table((*conditions, 'episodes', 'solved', '95% of the posterior'), shown)}\n\n{words}"
 
 

@@ -1,4 +1,4 @@
-"""Trainings and agents on disk, and what they are: one safetensors file each, never a pickle."""
+"""States of trainings and agents on disk, and their identity: one safetensors file each, never a pickle."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
     """Write tensors, and JSON-serialisable facts, as one ``.safetensors`` file."""
     stored = as_json(facts)
     cpu = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
-    # One entry: the format keeps no order of several, and equal states have equal files.
+    # A single entry, because the format keeps no order of several, and equal states must have equal files.
     metadata = {"facts": json.dumps(stored | {"sha256": digest_of_state(stored, cpu)})}
     write_atomic(path, lambda temporary: save_file(cpu, temporary, metadata=metadata))
 
@@ -30,7 +30,7 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
 def load_state(
     path: Path, what: str = "training state", advice: str = "Remove it to train again"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_state` wrote, once: what is checked is what is given back."""
+    """Read a file of :func:`save_state`, only once, so that the returned values are the checked ones."""
     check_regular(path)
     try:
         tensors, metadata = read_tensors(path.read_bytes())
@@ -43,7 +43,7 @@ def load_state(
 
 
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of what a state holds."""
+    """Return the SHA-256 of a state's content."""
     digest = hashlib.sha256(json.dumps(facts).encode())
     for name in sorted(tensors):
         value = tensors[name]
@@ -54,7 +54,7 @@ def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Name the state in a ``ValueError`` for whatever entries that are not as they were saved lead to."""
+    """Turn any error from damaged entries into a ValueError that names the state."""
     try:
         yield
     except Exception as error:
@@ -64,29 +64,29 @@ def restoring(path: Path) -> Iterator[None]:
         ) from error
 
 
-def check_identity(path: Path, theirs: Any, mine: Mapping[str, Any]) -> None:
-    """Refuse a state that belongs to another training, naming the first part that differs."""
-    theirs = theirs if isinstance(theirs, dict) else {}
-    for part, value in as_json(mine).items():
-        found = theirs.get(part)
-        if found != value:
-            if isinstance(found, dict) and isinstance(value, dict):  # what differs alone
-                keys = [key for key in {**found, **value} if found.get(key) != value.get(key)]
-                found, value = ({key: each.get(key) for key in keys} for each in (found, value))
+def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None:
+    """Raise ValueError if a state belongs to another training, with the first part that differs."""
+    stored = stored if isinstance(stored, dict) else {}
+    for part, value in as_json(expected).items():
+        saved = stored.get(part)
+        if saved != value:
+            if isinstance(saved, dict) and isinstance(value, dict):  # name only the options that differ
+                keys = [key for key in {**saved, **value} if saved.get(key) != value.get(key)]
+                saved, value = ({key: each.get(key) for key in keys} for each in (saved, value))
             raise ValueError(
-                f"{path} belongs to another {part}: it has {found}, this run has {value}. Use the same "
+                f"{path} belongs to another {part}: it has {saved}, this run has {value}. Use the same "
                 "options, or another output folder."
             )
 
 
 def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
-    """The optimiser's per-parameter tensors, by position and name."""
+    """Return the optimiser's per-parameter tensors, by position and name."""
     state = optimizer.state_dict()["state"]
     return {f"{i}.{name}": value for i, slots in state.items() for name, value in slots.items()}
 
 
 def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Load :func:`snapshot_optimizer`'s tensors into an optimiser of the same parameters."""
+    """Load :func:`snapshot_optimizer`'s tensors into an optimiser with the same parameters."""
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)
@@ -100,24 +100,24 @@ def named(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def select(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The inverse of :func:`named`."""
+    """Invert :func:`named`."""
     start = f"{prefix}/"
     return {name[len(start) :]: value for name, value in values.items() if name.startswith(start)}
 
 
 def module_tensors(module: nn.Module) -> dict[str, Tensor]:
-    """A detached state dict under plain names: what was trained compiled goes on uncompiled."""
+    """Return a detached state dict with the names of the uncompiled module."""
     return {n: value.detach() for n, value in without_compilation(module.state_dict()).items()}
 
 
 def restore_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Load what :func:`module_tensors` gave; a ``RuntimeError`` if names or shapes differ."""
+    """Load the tensors of :func:`module_tensors`; raise RuntimeError if names or shapes differ."""
     plain = dict(zip(module_tensors(module), module.state_dict(), strict=True))
     module.load_state_dict({plain.get(name, name): value for name, value in tensors.items()})
 
 
 def rng_tensors(generator: torch.Generator) -> dict[str, Tensor]:
-    """State of a generator and of PyTorch's global ones (dropout draws from them)."""
+    """Return the state of a generator and of PyTorch's global ones (which dropout uses)."""
     states = {"generator": generator.get_state(), "global": torch.get_rng_state()}
     if generator.device.type == "cuda":
         states["cuda"] = torch.cuda.get_rng_state(generator.device)
@@ -125,7 +125,7 @@ def rng_tensors(generator: torch.Generator) -> dict[str, Tensor]:
 
 
 def restore_rng(generator: torch.Generator, states: Mapping[str, Tensor]) -> None:
-    """Load what :func:`rng_tensors` gave."""
+    """Load the states of :func:`rng_tensors`."""
     generator.set_state(states["generator"])
     torch.set_rng_state(states["global"])
     if generator.device.type == "cuda":
@@ -133,11 +133,11 @@ def restore_rng(generator: torch.Generator, states: Mapping[str, Tensor]) -> Non
 
 
 HASHED_AT_ONCE = 2**26
-"""Bytes of the data."""
+"""The bytes of data that are hashed at once."""
 
 
 def part_identity(part: Any) -> Any:
-    """A part's configuration, or a function's name, with a digest of what is not trained in it."""
+    """Return a part's configuration, or a function's name, with a digest of its untrained values."""
     if part is None:
         return None
     part = uncompiled(part)
@@ -148,7 +148,7 @@ def part_identity(part: Any) -> Any:
 
 
 def fixed_identity(part: object) -> dict[str, str]:
-    """Digest of what is not trained, such as moments: it is part of what a network, or a prior, is."""
+    """Return a digest of a part's untrained values, such as moments, which belong to its identity."""
     if not isinstance(part, nn.Module):
         return {}
     trained = {n for n, p in part.named_parameters(remove_duplicate=False) if p.requires_grad}
@@ -159,11 +159,11 @@ def fixed_identity(part: object) -> dict[str, str]:
 
 
 def data_digest(data: TensorDictBase) -> str:
-    """Digest of demonstrations: of the names and values of all entries."""
+    """Return a digest of demonstrations, from the names and values of all entries."""
     digest = hashlib.sha256()
     for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
         digest.update(str(key).encode())
-        rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # it may be larger than the memory
+        rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # an entry may be larger than the memory
         for part in value.split(rows):
             digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Episodes of a policy and their outcomes, the same episodes for every policy."""
+"""Evaluation episodes and their outcomes; every policy plays the same episodes."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
 
 Act = Callable[[TensorDictBase], TensorDictBase]
-"""Writes the next chunk."""
+"""A function that writes the next chunk."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """Outcome of one evaluation episode.
+    """The outcome of one evaluation episode.
 
     Attributes:
         seed: simulator seed of the reset.
-        success: whether the task was solved at any step.
-        steps: control steps executed.
-        measures: what was asked for besides, see :func:`play_episode`.
-        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, of an agent the decoded one,
-            the mean of its source and where that is warm, if it has one, under ``"next"``
-            ``"executed_steps"`` and ``"done"``, and the delay with what was left of the chunk before, if
-            chunks took effect late. Concatenated along ``D`` episodes are a rollout for
+        success: True if the task was solved at any step.
+        steps: number of executed control steps.
+        measures: values of further keys, see :func:`play_episode`.
+        decisions: the policy's decisions, ``[D]``, with ``("vla_action", "chunk")`` (for an agent, the
+            decoded chunk), ``("next", "executed_steps")`` and ``("next", "done")``; the source's ``loc`` and
+            ``warm``, if the policy has a source; and the delay and the history's forecast, if chunks took
+            effect late. Episodes concatenated along ``D`` are a rollout for
             :func:`~warmprior.diagnostics.smoothness`.
 
     Examples:
@@ -61,11 +61,11 @@ class Episode:
 
 
 Measures = Mapping[str, Literal["max", "sum", "last"]]
-"""Keys of an environment, and how an episode combines their values."""
+"""A mapping from an environment's keys to the way in which an episode combines their values."""
 
 
 class _Tally:
-    """What is known of an episode under way."""
+    """The results so far of an episode that is being played."""
 
     def __init__(self, success: NestedKey, measures: Measures) -> None:
         self._success_key, self._how = success, measures
@@ -74,7 +74,7 @@ class _Tally:
         self._decisions: list[TensorDictBase] = []
 
     def add(self, after: TensorDictBase, decision: TensorDictBase) -> None:
-        """A decision, and what the environment says after it."""
+        """Add a decision and the environment's output after it."""
         self._decisions.append(decision)
         self._solved |= bool(after[self._success_key])
         self._steps += int(after[keys.EXECUTED])
@@ -85,7 +85,7 @@ class _Tally:
             self._values[key] = combined[how]
 
     def episode(self, seed: int) -> Episode:
-        """The episode, which has ended."""
+        """Return the finished episode."""
         done = torch.zeros(len(self._decisions), 1, dtype=torch.bool)
         done[-1] = True
         rollout = TensorDictBase.stack(self._decisions).set(("next", "done"), done)
@@ -94,17 +94,17 @@ class _Tally:
 
 @contextmanager
 def _acting(policy: TensorDictModuleBase, env: EnvBase, seed: int, nfe: int | None) -> Iterator[Act]:
-    """A policy that draws from a seed, and so do environments; later draws stay as they were."""
+    """Yield the call of a policy whose draws follow from a seed; generators are restored afterwards."""
     policy.eval()
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
-    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
+    # A policy without an agent, such as random residuals for a decoder, may have no parameters.
     home = env.device or torch.device("cpu")
     tensors = chain(policy.parameters(), policy.buffers())
     device = next((tensor.device for tensor in tensors), torch.device("cpu"))
     if "generator" in inspect.signature(policy.forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
-        seed ^= 1  # environments draw something else
-    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
+        seed ^= 1  # another seed for the environments
+    # One thread: the simulators need the cores, and idle threads of a small policy would spin.
     with torch_threads(1), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         yield lambda data: policy(data.to(device), **options).to(home)
@@ -121,30 +121,31 @@ def play_episode(
     success: NestedKey = keys.SUCCESS,
     measures: Measures | None = None,
 ) -> Episode:
-    """Play the episode of one seed.
+    """Play the episode that starts from a seed.
 
-    The policy's noise belongs to the episode: its generator is seeded by
-    ``numpy.random.SeedSequence((policy_seed, seed)).generate_state(1, "uint64")``. With decisions made
-    one at a time and by one thread, the outcome depends on the arguments alone.
+    Every episode has its own noise: the policy's generator is seeded by
+    ``numpy.random.SeedSequence((policy_seed, seed)).generate_state(1, "uint64")``. The policy decides one
+    step at a time on one thread, so the outcome depends only on the arguments.
 
     Args:
-        policy: as for :func:`evaluate`.
-        env: an environment without batch dimensions, with the policy's transforms; it starts the same
+        policy: see :func:`evaluate`.
+        env: an environment without batch dimensions, with the policy's transforms; it must start the same
             episode after every ``set_seed(seed)``.
-        seed: of the environment, at least 0.
+        seed: seed of the environment, at least 0.
 
     Keyword Args:
-        nfe: as for :func:`evaluate`.
-        policy_seed: of the policy's random draws, at least 0.
-        success: the environment's key for whether the task is solved, one flag; solved at any step is solved.
-            The key of an ``info`` works as well, where the environment reads it
+        nfe: see :func:`evaluate`.
+        policy_seed: seed of the policy's random draws, at least 0.
+        success: the environment's key of a flag for success; an episode succeeds if it is True at any step.
+            A key of Gymnasium's ``info`` works too, if the environment reads it
             (``GymEnv(...).auto_register_info_dict()``).
-        measures: further keys, one number each, and what an episode reports of their values: the
-            ``"max"``, ``"sum"`` or ``"last"``. Give both to :func:`~warmprior.policy_transforms` too.
+        measures: further keys, each with one number per step, and the value that an episode reports: the
+            ``"max"``, ``"sum"`` or ``"last"``. Pass ``success`` and ``measures`` to
+            :func:`~warmprior.policy_transforms` too.
 
     Raises:
         ValueError: if the environment has batch dimensions, or a seed is negative.
-        KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
+        KeyError: if the environment lacks ``success``, one of ``measures``, or the policy's transforms.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -191,40 +192,39 @@ def evaluate(
     measures: Measures | None = None,
     description: str | None = None,
 ) -> list[Episode]:
-    """Play episodes; their outcomes in order of their seeds.
+    """Play episodes and return their outcomes in the order of their seeds.
 
     The same arguments and number of environments give the same result.
 
     Args:
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
-            followed by a :class:`~warmprior.PriorDecoder`; set to evaluation mode.
-        env: a :class:`Task`; or an environment with the policy's transforms. A single one plays the
-            episodes one after another, see :func:`play_episode`. A batched one ``[n]`` plays ``n`` at a
-            time, and the noise that an episode meets depends on ``n``: that of :func:`parallel_env`, any
-            ``SerialEnv`` or ``ParallelEnv`` (each of whose environments is seeded by itself, and has to
-            start the same episode after every ``set_seed(seed)``), or one whose class says ``strided_seeds
-            = True``: after ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed +
-            i``, ``seed + i + n``, ...
+            followed by a :class:`~warmprior.PriorDecoder`; it is set to evaluation mode.
+        env: a :class:`Task`, or an environment with the policy's transforms. A single environment plays one
+            episode after another, see :func:`play_episode`. A batched environment ``[n]`` plays ``n`` at a
+            time, and the noise of an episode depends on ``n``. It may come from :func:`parallel_env`, be any
+            ``SerialEnv`` or ``ParallelEnv`` (each environment is seeded separately, and must start the same
+            episode after every ``set_seed(seed)``), or have a class with ``strided_seeds = True``: after
+            ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed + i``,
+            ``seed + i + n``, ...
 
     Keyword Args:
-        episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
-        first_seed: keep it away from the data's seeds.
+        episodes: number of episodes; episode ``e`` starts from simulator seed ``first_seed + e``.
+        first_seed: the first simulator seed; choose seeds that the demonstrations do not use.
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
-        policy_seed: of what is drawn in this process: by a policy that takes a ``generator``, and by what
-            draws from PyTorch's global one, which goes on afterwards as if nothing had been played.
+        policy_seed: seed of all draws in this process, from the ``generator`` of a policy that takes one and
+            from PyTorch's global generator, whose state is restored afterwards.
         success: see :func:`play_episode`.
-        measures: likewise.
-        description: of the progress bar; no bar if ``None``.
+        measures: see :func:`play_episode`.
+        description: label of the progress bar; no bar if ``None``.
 
     Raises:
-        ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
-            episodes of given seeds in its rows, or adds an offset to them; if the policy keeps a normaliser
-            that the environment lacks.
+        ValueError: if ``episodes < 1``; if the environment has several batch dimensions, cannot play given
+            seeds in its rows, or adds an offset to them; or if it lacks the policy's normaliser.
         KeyError: see :func:`play_episode`.
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
     See Also:
-        :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
+        :func:`~warmprior.diagnostics.success_posterior`: the success rate's posterior distribution.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -289,7 +289,7 @@ def _play_batched(
             seed_row(i, seeds[i])
         data = env.reset()
         while sum(played) < len(seeds):
-            # A worker whose episodes are all played rests; its episode numbers are i + n * played.
+            # Worker i plays the episodes i + n * played, and rests once it has played all of them.
             active = torch.tensor([i + num_envs * played[i] < len(seeds) for i in range(num_envs)])
             if not active.all():
                 data.set("_step", active.to(home))
@@ -312,44 +312,44 @@ def _play_batched(
 
 
 def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
-    known = env.observation_spec.keys(True, True)
+    present = env.observation_spec.keys(True, True)
     for key in (success, *measures):
-        if key not in known and key not in env.reward_keys:
+        if key not in present and key not in env.reward_keys:
             raise KeyError(
-                f"the environment does not write {key!r}, it writes {sorted(map(str, known))}: name the key "
-                "with success= or measures="
+                f"the environment does not write {key!r}, it writes {sorted(map(str, present))}: name the "
+                "key with success= or measures="
             )
-    if keys.EXECUTED not in known or keys.ACTIONS not in known:
+    if keys.EXECUTED not in present or keys.ACTIONS not in present:
         raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
 
 
 def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
-    """Whether the environment is normalised as the normaliser that the policy keeps says."""
+    """Raise ValueError if the environment lacks the policy's normaliser."""
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
-        return  # what lies inside of workers cannot be asked
-    found: dict[NestedKey, Any] = {}
+        return  # transforms inside workers cannot be inspected
+    scalings: dict[NestedKey, Any] = {}
     while isinstance(env, TransformedEnv):
         for part in env.transform.modules():
             if isinstance(part, ActionScaling):
-                found[part.in_keys_inv[0]] = part
+                scalings[part.in_keys_inv[0]] = part
             elif isinstance(part, ObservationNorm):
-                found[part.in_keys[0]] = part
+                scalings[part.in_keys[0]] = part
         env = env.base_env
     for key in normalizer.keys:
         for name in ("loc", "scale"):
-            mine = getattr(normalizer, name)(key)
-            if key not in found or not torch.equal(getattr(found[key], name).to(mine), mine):
+            value = getattr(normalizer, name)(key)
+            if key not in scalings or not torch.equal(getattr(scalings[key], name).to(value), value):
                 raise ValueError(
-                    f"the policy was trained in the units of its normaliser, and the environment has "
-                    f"{'another' if key in found else 'none'} for {key!r}: give policy_transforms(..., "
-                    "normalizer=policy.normalizer), or play policy.replace(normalizer=None) where the "
+                    f"the policy was trained in the units of its normaliser, but the environment has "
+                    f"{'another' if key in scalings else 'none'} for {key!r}: give policy_transforms(..., "
+                    "normalizer=policy.normalizer), or play policy.replace(normalizer=None) if the "
                     "environment is in these units already"
                 )
 
 
 def _decision(data: TensorDictBase) -> TensorDictBase:
-    """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
+    """Return the entries of a step that :attr:`Episode.decisions` keeps, on the CPU."""
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
     kept = data.select(keys.CHUNK, keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False)
     decoded = data.get(("next", *keys.DECODED_CHUNK), None)

@@ -19,18 +19,18 @@ from warmprior.transforms.absolute_actions import AbsoluteActions
 
 
 def opened(place: Path | str, task: str | None = None, mask: str | None = None) -> Demonstrations:
-    """The demonstrations at a place; the task's environment is theirs where they do not say."""
+    """Open the demonstrations at a place, with the task's environment if they do not describe one."""
     return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
 
 
 def task_name(dataset: DemonstrationReplay | DatasetIndex) -> str:
-    """Short name of a dataset's task, or the environment's where it is none of ours."""
+    """Return the short name of a dataset's task, or its environment's name if no task has it."""
     task = dataset.task
     return str(dataset.env_args["env_name"]).lower() if task is None else task.name
 
 
 def image_names(cameras: Sequence[str]) -> list[str]:
-    """The names of the cameras' images in files."""
+    """Return the names of the cameras' images in files."""
     return [f"{camera}_image" for camera in cameras]
 
 
@@ -43,16 +43,22 @@ def recorded_task(
     actions: Literal["delta", "absolute"],
     horizon: int | None,
 ) -> dict[str, Any]:
-    """Data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
-    seen = None
+    """Return data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
+    low_dim_keys = None
     if images is None and (dataset.task is None or dataset.observation_keys != dataset.task.low_dim_keys):
-        seen = dataset.observation_keys
+        low_dim_keys = dataset.observation_keys
     description = environment_description(
-        dataset.env_args, style, observation_steps, actions, images, low_dim_keys=seen, horizon=horizon
+        dataset.env_args,
+        style,
+        observation_steps,
+        actions,
+        images,
+        low_dim_keys=low_dim_keys,
+        horizon=horizon,
     )
     make_env, adapters = robosuite_parts(description)
-    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
-    # positions, which range far, do not weigh little beside the gripper in the loss.
+    # Poses in the units of deltas: errors and sigma have the same meaning in both spaces, and the loss does
+    # not give positions, whose range is large, little weight compared with the gripper.
     absolute = adapters.get("actions")
     units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
     vector = OBSERVATION if images is None else (OBSERVATION, STATE)
@@ -64,14 +70,14 @@ def recorded_task(
         "normalizer": normalizer,
         "adapters": adapters,
         "rest": None if absolute is None else RestingPose(dataset.pose_columns, normalizer),
-        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
+        # Actions outside the range of the demonstrations are executed, and remembered, at its bound.
         "clip": 1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
         "environment": description,
     }
 
 
 def read_steps(
-    found: Demonstrations,
+    demonstrations: Demonstrations,
     *,
     absolute_actions: bool = False,
     observation_keys: Sequence[str] | None = None,
@@ -79,18 +85,18 @@ def read_steps(
     fast_rendering: bool = False,
     demos: int | None = None,
 ) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
-    """The demonstrations as policies are to see them, and what images are among it, if any."""
+    """Return the demonstrations as policies see them, and the options of their images, if any."""
     if not cameras:
         options: Mapping[str, Any] = {"absolute_actions": absolute_actions}
-        return found.replay(**options, observation_keys=observation_keys, demos=demos), None
+        return demonstrations.replay(**options, observation_keys=observation_keys, demos=demos), None
     if absolute_actions:
         raise ValueError("images go with pose deltas: leave out actions='absolute', or the cameras")
-    check_images(found, cameras, fast_rendering)
-    # What robomimic's image policies see besides: the robot, and not where the objects are.
-    vector = [key for key in found.index(demos=demos).observation_keys if key != "object"]
+    check_images(demonstrations, cameras, fast_rendering)
+    # As in robomimic, image policies also see the robot's state, but not that of the objects.
+    vector = [key for key in demonstrations.index(demos=demos).observation_keys if key != "object"]
     vector = vector if observation_keys is None else list(observation_keys)
     names = image_names(cameras)
-    dataset = found.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
+    dataset = demonstrations.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
     return dataset, {
         "cameras": list(cameras),
         "size": dataset.image_size,

@@ -1,4 +1,4 @@
-"""One episode in pictures: a film, or a strip of a few of them."""
+"""One episode in pictures: a video, or a strip of a few frames."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from warmprior.transforms.inner_step import EnvTransform
 
 
 class _Recorder(EnvTransform):
-    """Keeps what a function sees after the reset and after every control step."""
+    """A recorder of a function's results after the reset and after every control step."""
 
     def __init__(self, look: Callable[[], Any]) -> None:
         super().__init__()
         self.look = look
-        self.seen: list[Any] = []
+        self.records: list[Any] = []
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.seen.append(self.look())
+        self.records.append(self.look())
         return next_tensordict
 
 
 def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: int) -> None:
-    """A film with as many pictures per second."""
+    """Write a video with ``rate`` pictures per second."""
     av = require("av", "lerobot")
 
     def write(temporary: Path) -> None:
@@ -57,13 +57,13 @@ def _resized(image: np.ndarray, size: int) -> np.ndarray:
 
 def _picture(env: Any) -> np.ndarray:
     try:
-        # Gymnasium's environments of MuJoCo fail in their own way where they were made without a mode.
+        # Gymnasium's MuJoCo environments raise another error if they were made without a render mode.
         picture = env.render() if getattr(env, "render_mode", "rgb_array") is not None else None
     except NotImplementedError:
         picture = None
     if picture is None:
         raise ValueError(
-            "the environment draws no pictures: make it with render_mode='rgb_array', or ask for no films "
+            "the environment draws no pictures: make it with render_mode='rgb_array', or request no videos "
             "(film_rate=None)"
         )
     return picture
@@ -71,12 +71,12 @@ def _picture(env: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Filmstrip:
-    """Evenly spaced frames of one episode.
+    """The evenly spaced frames of one episode.
 
     Attributes:
-        frames: uint8 ``[h, w, 3]`` each; the first before the first action, the last at the end.
+        frames: pictures, uint8 ``[h, w, 3]`` each; the first before the first action, the last at the end.
         steps: control steps executed before each frame.
-        success: whether the task was solved.
+        success: True if the task was solved.
 
     Examples:
         >>> import numpy as np
@@ -104,7 +104,7 @@ def record_filmstrip(
     rate: int | None = None,
     **options: Any,
 ) -> Filmstrip:
-    """Play the episode of one seed, that of :func:`play_episode`, and render evenly spaced control steps.
+    """Play the same episode as :func:`play_episode`, and render evenly spaced control steps.
 
     Args:
         actor: a policy that keeps its environment's description.
@@ -112,18 +112,19 @@ def record_filmstrip(
     Keyword Args:
         seed: simulator seed of the episode.
         nfe: network evaluations per chunk; the policy's own by default.
-        policy_seed: of the source samples.
-        frames: how many pictures.
-        size: side of a picture in pixels, even for a video.
-        video: where to write an MP4 of the same episode as well; needs PyAV.
-        env: another environment than the one that the policy describes, with the policy's transforms; its
-            base has a method ``render`` that gives a picture, uint8 ``[h, w, 3]``. It is closed at the end.
+        policy_seed: seed of the source samples.
+        frames: number of pictures.
+        size: side of a picture in pixels; it must be even for a video.
+        video: path of an MP4 of the episode, if one is to be written; needs PyAV.
+        env: environment to play instead of the one that the policy describes, with the policy's transforms;
+            its base must have a method ``render`` that returns a picture, uint8 ``[h, w, 3]``. It is closed
+            at the end.
         rate: control steps per second of a video; that of the policy's environment by default.
-        options: further ones of :func:`~warmprior.envs.environment_of`; and ``success``, see
+        options: further options of :func:`~warmprior.envs.environment_of`; and ``success``, see
             :func:`play_episode`.
 
     Raises:
-        RuntimeError: if nothing on this machine can render; the message names the packages to install.
+        RuntimeError: if this machine cannot render; the message names the packages to install.
         ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
 
     Examples:
@@ -156,7 +157,7 @@ def record_filmstrip(
         env = environment_of(actor, **options)
         simulator, loop = env.base_env, env.base_env.loop
         look = loop.state
-        # In full quality a film, of a picture per control step, would take ten times as long as the episode.
+        # Rendering every control step of a video in full quality would take ten times as long as the episode.
         renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
         frame, quick = (
             lambda state, size: simulator.render_frame(size=size, state=state),
@@ -165,26 +166,27 @@ def record_filmstrip(
         rate = rate or round(1 / loop.env.control_timestep)
     else:
         look = partial(_picture, env.base_env)
-    # First, and so one of the transforms that run at every control step inside of a chunk.
+    # Inserted first, so that it runs at every control step inside a chunk.
     recorder = _Recorder(look)
     env.transform.insert(0, recorder)
     try:
         played = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed, success=success)
-        steps = np.unique(np.linspace(0, len(recorder.seen) - 1, frames).round().astype(int))
-        pictures = [frame(recorder.seen[step], size) for step in steps]
+        records = recorder.records
+        steps = np.unique(np.linspace(0, len(records) - 1, frames).round().astype(int))
+        pictures = [frame(records[step], size) for step in steps]
         if video is not None:
-            _write(video, (quick(seen, size) for seen in recorder.seen), size, rate or 20)
+            _write(video, (quick(record, size) for record in records), size, rate or 20)
     finally:
         env.close()
     return Filmstrip(pictures, steps.tolist(), played.success)
 
 
 def check_video(path: Path) -> None:
-    """Refuse, before any episode, a film that could not be written here or has another ending than .mp4."""
+    """Raise an error, before any episode, if a video could not be written or does not end in .mp4."""
     from warmprior.envs.rendering import require_rendering
 
     if path.suffix != ".mp4":
-        raise ValueError(f"{path} must end in .mp4: films have no other format")
+        raise ValueError(f"{path} must end in .mp4: videos have no other format")
     require("av", "lerobot")
     require_rendering()
     check_writable(path.parent)

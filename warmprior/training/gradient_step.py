@@ -1,4 +1,4 @@
-"""One gradient step of behaviour cloning, and all that it changes."""
+"""A gradient step of behaviour cloning, and the state that it changes."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class GradientStep:
     """The losses of a policy, its optimiser, learning-rate schedule and averaged weights (Table 3).
 
     Args:
-        actor: the policy; its network is trained in place, and its prior where that has weights.
+        actor: the policy; its network, and its prior if it has weights, are trained in place.
         config: the recipe.
         coupling: pairs sources and targets.
-        generator: source of randomness of the losses, on the network's device.
+        generator: draws the losses' randomness, on the network's device.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class GradientStep:
         coupling: Coupling | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        #: The network, and the prior where it has weights as well.
+        #: The network, and the prior if it has weights.
         self.trained = nn.ModuleDict({"network": actor.network})
         if isinstance(actor.prior, nn.Module):
             self.trained["prior"] = actor.prior
@@ -64,7 +64,7 @@ class GradientStep:
         if world_size() > 1:
             self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
         self._device = generator.device if generator is not None else torch.device("cpu")
-        # Without the cache: what the teacher casts without gradients must not be taken for the weights.
+        # Without the cache, which could return weights that the teacher has cast without gradients.
         self._precision = partial(
             torch.autocast,
             self._device.type,
@@ -75,7 +75,7 @@ class GradientStep:
         self.optimizer = make_optimizer(
             actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
         )
-        # A prior that learnt before is fixed by then.
+        # A prior that was trained before has no parameters that require gradients.
         prior = actor.prior.parameters() if isinstance(actor.prior, nn.Module) else ()
         if learning := [parameter for parameter in prior if parameter.requires_grad]:
             self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
@@ -93,13 +93,13 @@ class GradientStep:
         """Take a step on a batch of windows; return its loss, a detached scalar."""
         if self._count_padding:
             batch = batch.exclude(keys.IS_PAD)
-        if self._graphs:  # what the graphs of the last step have left may be overwritten
+        if self._graphs:  # the graphs may overwrite the outputs of the last step
             torch.compiler.cudagraph_mark_step_begin()
         with self._precision():
             loss = self._loss(batch)
         self.optimizer.zero_grad()
         loss.backward()
-        if self._max_grad_norm is not None:  # of all processes by now
+        if self._max_grad_norm is not None:  # gradients are already averaged over all processes
             nn.utils.clip_grad_norm_(self.trained.parameters(), self._max_grad_norm)
         self.optimizer.step()
         self.schedule.step()
@@ -119,7 +119,7 @@ class GradientStep:
         }
 
     def load(self, tensors: Mapping[str, Tensor], iteration: int) -> None:
-        """Go on from what :meth:`state` gave after an iteration."""
+        """Continue from the tensors that :meth:`state` returned after an iteration."""
         restore_module(self.trained, select("trained", tensors))
         restore_module(self.ema, select("ema", tensors))
         restore_optimizer(self.optimizer, select("optimizer", tensors))
@@ -131,7 +131,7 @@ class GradientStep:
 
 
 class _WeightedSum(nn.Module):
-    """The weighted sum of the losses of a batch, whose gradients DDP averages."""
+    """The weighted sum of a batch's losses, whose gradients DDP averages."""
 
     def __init__(self, losses: dict[FlowMatchingLoss, float]) -> None:
         super().__init__()

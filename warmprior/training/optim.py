@@ -1,4 +1,4 @@
-"""Optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 3)."""
+"""The optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from warmprior.modules.network import VelocityNetwork, uncompiled
 
 
 def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:
-    """AdamW with the paper's values, for a :class:`~warmprior.VelocityNetwork`, compiled or not.
+    """Return AdamW with the paper's values, for a :class:`~warmprior.VelocityNetwork`, compiled or not.
 
     Biases, norms and position embeddings do not decay.
     """
@@ -26,7 +26,7 @@ def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_de
 
 
 def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:
-    """Linear warm-up over the first share of the iterations, then a cosine to zero.
+    """Return a schedule with linear warm-up over the first iterations, then a cosine to zero.
 
     Args:
         optimizer: its learning rates are the peaks.
@@ -58,7 +58,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
 
 def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
-    """Exponential moving average of a network's weights; the averaged copy is ``.module``.
+    """Return an exponential moving average of a network's weights; the averaged copy is ``.module``.
 
     ``rate``, in [0, 1), is the decay per update. The first update copies the weights.
 
@@ -81,21 +81,21 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
 
 
 def _move(averaged: list[Tensor], current: list[Tensor], _: Tensor, *, rate: float) -> None:
-    # No closure, as PyTorch's own is: policies that hold an average are pickled.
+    # A function and not a closure as in PyTorch, because policies that hold an average are pickled.
     torch._foreach_lerp_(averaged, current, 1 - rate)
 
 
 class _Average(AveragedModel):
-    """An average whose update does not wait for the device: PyTorch's copies the count there every time."""
+    """An average that keeps its count on the CPU: PyTorch's waits for the device at every update."""
 
     @torch.no_grad()
     def update_parameters(self, model: nn.Module) -> None:
-        mine: list[Tensor] = list(self.module.parameters())
-        theirs: list[Tensor] = list(model.parameters())
-        if self.n_averaged.item():  # it stays on the CPU
-            cast(Any, self.multi_avg_fn)(mine, theirs, self.n_averaged)
+        averages: list[Tensor] = list(self.module.parameters())
+        weights: list[Tensor] = list(model.parameters())
+        if self.n_averaged.item():
+            cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
-            torch._foreach_copy_(mine, theirs)
+            torch._foreach_copy_(averages, weights)
         for averaged, buffer in zip(self.module.buffers(), model.buffers(), strict=True):
             averaged.copy_(buffer)
         self.n_averaged += 1

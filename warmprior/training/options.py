@@ -1,4 +1,4 @@
-"""What a training is asked for: the network and the recipe."""
+"""Options of a training: the network and the recipe."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """The velocity network.
+    """The options of the velocity network.
 
     Attributes:
-        network: mlp is small, and the default; chi_transformer is the paper's, and plain_mlp that of its toy;
-            adaln_transformer is a faster transformer (adaptive layer norm).
-        hidden_dim: its width; the class's own by default.
-        precondition: by the second moments of source and data, see PreconditionedNetwork.
+        network: mlp is small, and the default; chi_transformer is the paper's, and plain_mlp that of its toy
+            task; adaln_transformer is a faster transformer (adaptive layer norm).
+        hidden_dim: width of the network; the class's own by default.
+        precondition: use the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
-        observation_layers: of a transformer, hidden layers of the network that reads all To observations
+        observation_layers: transformers only; hidden layers of the network that reads all To observations
             together; by default 1 in adaln_transformer, and 0 in chi_transformer, which embeds each alone.
-        time_frequency: of a transformer, the last frequency of its time embedding, which starts from 1; 100
+        time_frequency: transformers only; the highest frequency of the time embedding, whose lowest is 1; 100
             by default.
-        encoder: of images, a network per camera: ResNet-18 from ImageNet's weights, which torchvision
-            downloads once, from random ones, or a small network.
-        crop_size: side of the random window of an image that is seen in training, the central one else.
-        share_encoder: one encoder for all cameras.
+        encoder: image encoder, one network per camera: ResNet-18 with ImageNet's weights, which torchvision
+            downloads once, ResNet-18 with random weights, or a small network.
+        crop_size: side of the crop of an image in pixels: random in training, central otherwise.
+        share_encoder: use one encoder for all cameras.
 
     Examples:
         >>> import torch
@@ -85,11 +85,11 @@ class NetworkOptions:
                 )
 
     def _of_transformers(self) -> dict[str, Any]:
-        asked = {"observation_layers": self.observation_layers, "time_frequency": self.time_frequency}
-        return {name: value for name, value in asked.items() if value is not None}
+        options = {"observation_layers": self.observation_layers, "time_frequency": self.time_frequency}
+        return {name: value for name, value in options.items() if value is not None}
 
     def without_images(self) -> NetworkOptions:
-        """With the defaults for what has no effect where no images are seen."""
+        """Return a copy with defaults for the options that have no effect without images."""
         usual = NetworkOptions()
         names = ("encoder", "crop_size", "share_encoder")
         return replace(self, **{name: getattr(usual, name) for name in names})
@@ -101,9 +101,9 @@ class NetworkOptions:
         prediction_length: int,
         images: Mapping[str, int] | None = None,
     ) -> VelocityNetwork:
-        """A network with fresh weights, for widths ``d_a`` and ``d_o`` and images of these sides in pixels.
+        """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
-        Beside images ``d_o`` is the width of the vector.
+        With images, ``d_o`` is the width of the vector.
         """
         kind, width = _NETWORKS[self.network]
         options = self._of_transformers()
@@ -138,31 +138,34 @@ CHOICES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The recipe; the defaults are those of the robot tasks' tables: a small preconditioned network on a CPU.
+    """The recipe of a training; by default the one of the robot tasks' tables, for a small network on a CPU.
 
-    They were chosen from success against iterations. PAPER is the paper's recipe. A ValueError
-    names a number that is out of its range.
+    The defaults were chosen from success against iterations. PAPER is the paper's recipe. Raises ValueError
+    if a number is out of range.
 
     Attributes:
         iterations: gradient steps.
-        batch_size: windows per step, of all processes together.
+        batch_size: windows per step, over all processes together.
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
         warmup_ratio: share of the iterations over which the learning rate rises.
-        max_grad_norm: to which longer gradients are shortened, of all weights together; none by default.
+        max_grad_norm: largest norm of the gradient of all weights, to which longer ones are clipped; no limit
+            by default.
         ema_rate: decay of the averaged weights that are evaluated.
-        checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
+        checkpoints: largest number of policies to keep, evenly spaced, the last at the end.
         save_every: iterations between saves of the training state, ten per checkpoint by default.
         log_every: iterations per logged mean loss.
-        seed: of initial weights, sampling, source, times and dropout.
-        times: how the times of the loss are distributed.
+        seed: seed of initial weights, sampling, source, times and dropout.
+        times: distribution of the times of the loss.
         objective: the loss: squared error of velocities, or L1 error of predicted samples (L1 Flow).
-        weighting: of the loss: errors as they are (velocity), or in units of what preconditioning leaves, so
-            that every time counts alike (standardised). By default the latter where the network is
-            preconditioned.
-        self_distillation: weight of learning in one step where the flow of averaged weights ends.
-        count_padding: actions past the end of an episode, where its last one is repeated, count in the loss.
-        precision: of the network's matrix products in training; weights, averages and optimiser are float32.
+        weighting: weighting of the loss: errors unchanged (velocity), or divided by the standard deviation
+            that preconditioning leaves, so that all times have equal weight (standardised). The latter is the
+            default for a preconditioned network.
+        self_distillation: weight of the loss that trains one step to end where the flow of averaged weights
+            ends.
+        count_padding: let actions past an episode's end, where its last one is repeated, count in the loss.
+        precision: precision of the network's matrix products in training; weights, averages and optimiser are
+            float32.
         cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
 
     Examples:
@@ -198,7 +201,7 @@ class TrainingConfig:
             check_whole_numbers(save_every=self.save_every)
         if self.max_grad_norm is not None:
             check_positive(max_grad_norm=self.max_grad_norm)
-        if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # others are counted from it
+        if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # other seeds are offsets from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
         for name, words, fits in (
             ("learning_rate", "be > 0", lambda value: value > 0),
@@ -216,11 +219,11 @@ class TrainingConfig:
             if getattr(self, name) is not None:
                 check_choice(name, getattr(self, name), choices)
         if self.self_distillation and self.times == "start":
-            raise ValueError("self_distillation needs a flow, and times = 'start' trains none")
+            raise ValueError("self_distillation needs a flow, but times = 'start' trains none")
 
     @property
     def checkpoint_iterations(self) -> list[int]:
-        """After which iterations a policy is kept."""
+        """Return the iterations after which a policy is kept."""
         n = min(self.checkpoints, self.iterations)
         return [round(self.iterations * (i + 1) / n) for i in range(n)]
 

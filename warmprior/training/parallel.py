@@ -1,4 +1,4 @@
-"""Environments in worker processes, and what happens if one of them dies."""
+"""Environments in worker processes, and an error if one of them dies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], 
 
 
 class _StridedEnv(ParallelEnv):
-    """Its workers number their own episodes, see :func:`parallel_env`."""
+    """Environments whose workers number their own episodes, see :func:`parallel_env`."""
 
     strided_seeds = True
 
@@ -28,14 +28,14 @@ class _StridedEnv(ParallelEnv):
 def parallel_env(
     make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
 ) -> ParallelEnv:
-    """Environments in worker processes, with the policy's transforms inside the workers.
+    """Return environments in worker processes, with the policy's transforms inside the workers.
 
     Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of
     ``n`` plays the episodes ``i, i + n, i + 2n, ...`` after ``set_seed(seed, static_seed=True)``.
 
     Args:
-        make_env: called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker, see
-            :class:`~warmprior.envs.RobosuiteEnv`.
+        make_env: builds an environment, called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker,
+            see :class:`~warmprior.envs.RobosuiteEnv`.
         make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
         num_envs: number of workers, at least 1.
 
@@ -57,8 +57,7 @@ def parallel_env(
         partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
         for i in range(num_envs)
     ]
-    # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
-    # take a core from the workers.
+    # No shared buffers: with them the parent polls, and takes a core from the workers.
     return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
 
 
@@ -71,14 +70,14 @@ def base_of(env: EnvBase) -> EnvBase:
 
 @contextmanager
 def watched(env: EnvBase) -> Iterator[None]:
-    """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
+    """Raise an error if a worker dies, because TorchRL would wait for it for hours."""
     base = base_of(env)
     if isinstance(base, ParallelEnv) and base.is_closed:
         base.start()
     workers = list(base._workers) if isinstance(base, ParallelEnv) else []
     finished = threading.Event()
     dead = ""
-    # When it finds a dead worker, TorchRL ends and closes the others, which then answer nothing.
+    # TorchRL closes the other processes when it finds a dead worker, and closed ones raise ValueError.
     closed_by_torchrl = suppress(ValueError)
 
     def look() -> None:
@@ -88,7 +87,7 @@ def watched(env: EnvBase) -> Iterator[None]:
             with closed_by_torchrl:
                 if not worker.is_alive():
                     ended.append((worker.exitcode == -signal.SIGTERM, i, worker.exitcode))
-        if ended and not dead:  # TorchRL terminates the others: one that ended in another way was the first
+        if ended and not dead:  # TorchRL terminates the others, so one that ended differently died first
             _, i, code = min(ended)
             dead = f"worker {i} of {len(workers)} (exit code {code})"
 
@@ -115,7 +114,7 @@ def watched(env: EnvBase) -> Iterator[None]:
         # Without this, idle workers would keep the interpreter from exiting.
         try:
             env.close(raise_if_closed=False)
-        except Exception:  # closing complains about dead workers itself
+        except Exception:  # closing fails if workers are dead
             for worker in workers:
                 with closed_by_torchrl:
                     worker.terminate()

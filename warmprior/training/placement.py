@@ -1,4 +1,4 @@
-"""Where the demonstrations of a training lie, and how batches get from there to the network."""
+"""Placement of a training's demonstrations, and the way of batches from there to the network."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 from warmprior.io.distributed import from_leader
 
 DEVICE_SHARE = 0.5
-"""Of a GPU's free memory, what demonstrations may take: the rest is for the network and its training."""
+"""The share of a GPU's free memory for demonstrations; the rest is for the network and its training."""
 
 
 def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
-    """The demonstrations, contiguous steps, on the network's device if they fit, or where they are."""
+    """Move demonstrations, contiguous steps, to the network's device if they fit."""
     device = torch.device(device)
     if device.type != "cuda":
         return data.to(device)
@@ -25,15 +25,15 @@ def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
         free, _ = torch.cuda.mem_get_info(device)
         return data.bytes() <= DEVICE_SHARE * free
 
-    # The same for processes that train together: their windows are drawn by generators of one kind.
+    # The first process decides for all that train together: their generators must be of the same kind.
     return data.to(device) if from_leader(fits) else data
 
 
 class Prefetch:
-    """Batches, each gathered by a thread while the one before is computed with, and pinned for a GPU.
+    """A source of batches that a thread gathers one step ahead, and pins for a GPU.
 
-    Unlike TorchRL's, it knows the generator's state that belongs to the batch it gave last, so that a
-    training can be continued. Nothing else may draw from the generator.
+    Unlike TorchRL's prefetching, it keeps the generator's state after the batch that it returned last, so
+    that a training can be continued. Nothing else may draw from the generator.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class Prefetch:
         self._state = generator.get_state()
 
     def __call__(self) -> TensorDictBase:
-        """The next batch."""
+        """Return the next batch."""
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, "prefetch")
         coming = self._next or self._executor.submit(self._draw)
-        self._next = None  # whatever drawing it leads to
+        self._next = None  # also if gathering it has failed
         batch, self._state = coming.result()
         self._next = self._executor.submit(self._draw)
-        # Queued behind what the device still does, and not waited for.
+        # The copy is queued on the device, and the CPU does not wait for it.
         return batch if self._device is None else batch.to(self._device, non_blocking=True)
 
     def _draw(self) -> tuple[TensorDictBase, Tensor]:
@@ -67,11 +67,11 @@ class Prefetch:
         return batch, self._generator.get_state()
 
     def state(self) -> Tensor:
-        """State of the generator after the batch given last, as if none had been drawn ahead."""
+        """Return the generator's state after the batch returned last, without the batch drawn ahead."""
         return self._state
 
     def restore(self, state: Tensor | int) -> None:
-        """Go on from a state that :meth:`state` gave, or begin at a seed."""
+        """Continue from a state of :meth:`state`, or begin at a seed."""
         self.close()
         if isinstance(state, int):
             state = torch.Generator(self._generator.device).manual_seed(state).get_state()
@@ -79,7 +79,7 @@ class Prefetch:
         self._state = state
 
     def close(self) -> None:
-        """End the thread, as if no batch had been drawn ahead; the next call starts another."""
+        """End the thread and drop the batch drawn ahead; the next call starts another thread."""
         if self._executor is not None:
             self._executor.shutdown()
             self._generator.set_state(self._state)

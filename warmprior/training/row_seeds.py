@@ -1,4 +1,4 @@
-"""Which seed each row of a batched environment plays next."""
+"""Seeds of the episodes that the rows of a batched environment play."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from warmprior.training.parallel import base_of
 
 
 def row_seeding(env: EnvBase) -> Callable[[int, int], None]:
-    """Return what to call with a row and the seed of its next episode, before that is reset."""
+    """Return a function that sets the seed of a row's next episode, to be called before its reset."""
     base = base_of(env)
     if getattr(type(base), "strided_seeds", False):
         return lambda row, seed: None
     if not isinstance(base, (SerialEnv, ParallelEnv)):
         raise ValueError(
-            f"nothing tells which seeds the {env.batch_size[0]} rows of {type(base).__name__} play: put "
+            f"the seeds that the {env.batch_size[0]} rows of {type(base).__name__} play are unknown: put "
             "single environments into a SerialEnv, a ParallelEnv or parallel_env; or, if set_seed(seed, "
             "static_seed=True) lets row i play seed + i, seed + i + n, ..., set strided_seeds in its class"
         )
@@ -30,7 +30,7 @@ def row_seeding(env: EnvBase) -> Callable[[int, int], None]:
 
 
 def _has_offset(make_env: object) -> bool:
-    # Workers cannot be asked: one that lacks the attribute dies.
+    # Looked up here and not in the workers, because a worker without the attribute dies.
     if not isinstance(make_env, partial):
         return False
     return bool(make_env.keywords.get("seed_offset")) or any(

@@ -1,4 +1,4 @@
-"""Saved policies: one file that is read in one go, and its way to the Hugging Face hub and back."""
+"""Saved policies: a single file, in a folder or on the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -32,34 +32,34 @@ from warmprior.modules.trend import RestingAction
 from warmprior.training.checkpoint import load_state, save_state
 
 FORMAT = 7
-"""Version of the layout that :func:`save_policy` writes."""
+"""The version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 
 
 def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and configuration of the policy in a folder."""
+    """Return weights and configuration of the policy in a folder."""
     path = folder / WEIGHTS
     if not path.exists():
-        kept = sorted(found.parent.name for found in folder.glob(f"*/{WEIGHTS}"))
+        kept = sorted(file.parent.name for file in folder.glob(f"*/{WEIGHTS}"))
         reason = f"{WEIGHTS} is missing"
         if folder.is_file():
-            reason = "it is a file, and a policy is a folder"
+            reason = "it is a file, but a policy is a folder"
         elif kept:
             reason = f"it holds the policies {', '.join(kept)}: name one of them"
         raise FileNotFoundError(f"no policy at {folder}: {reason}")
     copy = None
     if (folder / CONFIG).is_file():
         copy = read_json(folder / CONFIG)
-        _check_format(folder / CONFIG, copy)  # earlier ones have no other place for it
+        _check_format(folder / CONFIG, copy)  # a policy of another format may have no configuration elsewhere
     tensors, config = load_state(path, "policy", "Copy it again")
     _check_format(path, config)
     if copy not in (None, config):
         differ = sorted(name for name in {*copy, *config} if copy.get(name) != config.get(name))
-        # Not refused: a save that was interrupted leaves the copy of the policy before.
+        # A warning only, because an interrupted save leaves the configuration of the policy before.
         warnings.warn(
-            f"{folder / CONFIG} differs in {', '.join(differ)} from {WEIGHTS} beside it, which counts: save "
-            "the policy again",
+            f"{folder / CONFIG} differs in {', '.join(differ)} from the configuration in {WEIGHTS}, which is "
+            "used: save the policy again",
             stacklevel=4,
         )
     return tensors, config
@@ -67,42 +67,44 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def _check_format(path: Path, config: Any) -> None:
     if not isinstance(config, dict) or "warmprior" not in config:
-        raise ValueError(f"{path} is of no policy of warmprior")
-    if config.get("format") != FORMAT:
-        found = config.get("format")
-        raise ValueError(f"{path} has format {found}, and this version reads {FORMAT}: save the policy again")
+        raise ValueError(f"{path} does not belong to a policy of warmprior")
+    version = config.get("format")
+    if version != FORMAT:
+        raise ValueError(
+            f"{path} has format {version}, but this version reads {FORMAT}: save the policy again"
+        )
 
 
 def _folder(place: str | Path, *, revision: str | None = None, token: str | None = None) -> Path:
-    """Where the files of a policy lie, fetched from the hub if need be."""
+    """Return the folder of a policy, after fetching it from the hub if needed."""
     path = Path(place)
     if path.exists() or not (isinstance(place, str) and is_repository(place)):
         if revision is not None:
-            raise ValueError(f"{place} is no repository at the hub: leave out revision={revision!r}")
+            raise ValueError(f"{place} is not a repository on the hub: leave out revision={revision!r}")
         return path
     hub = require("huggingface_hub", "sim")
     fetch = partial(hub.snapshot_download, place, token=token)
-    # The small file first: a repository of something else may be large.
+    # The small file first, because a repository without a policy may be large.
     try:
         folder = Path(fetch(revision=revision, allow_patterns=[CONFIG]))
     except OSError as error:
-        said = " ".join(str(error).split())
-        raise OSError(f"{place} is no folder here, and the hub does not give it: {said}") from error
+        reason = " ".join(str(error).split())
+        raise OSError(f"{place} is not a folder, and cannot be fetched from the hub: {reason}") from error
     if not (folder / CONFIG).exists():
-        raise ValueError(f"{place} at the hub holds no policy of warmprior: it has no {CONFIG}")
+        raise ValueError(f"{place} on the hub holds no policy of warmprior: it has no {CONFIG}")
     _check_format(folder / CONFIG, read_json(folder / CONFIG))
-    # Of the same commit, whatever happens to the branch meanwhile.
+    # From the same commit, since the branch may move between the two requests.
     return Path(fetch(revision=folder.name, allow_patterns=[WEIGHTS]))
 
 
 def check_repository(name: str) -> None:
-    """Raise ValueError if a text has not the form of a repository's name at the hub."""
+    """Raise ValueError if a text does not have the form of a repository's name on the hub."""
     if not is_repository(name):
-        raise ValueError(f"{name!r} is no name of a repository at the hub: use user/name")
+        raise ValueError(f"{name!r} is not the name of a repository on the hub: use user/name")
 
 
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
-    """Everything but the weights as JSON; a ``TypeError`` if a part cannot be written so."""
+    """Return everything except the weights as JSON; raise TypeError if JSON cannot hold a part."""
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):
         raise TypeError(f"cannot save {type(network).__name__}: only subclasses of VelocityNetwork are saved")
@@ -120,7 +122,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
-        # Of each part its own: half precision is too coarse for statistics.
+        # One precision per part, because half precision is too coarse for statistics.
         "precision": {
             name: str(dtype).removeprefix("torch.")
             for name, part in _parts(actor).items()
@@ -134,7 +136,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
 
 
 def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
-    """What has weights, under the names of the configuration."""
+    """Return the parts that have weights, under the names of the configuration."""
     parts = {
         "network": actor.network,
         "prior": actor.prior,
@@ -145,44 +147,44 @@ def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
 
 
 def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, Any]:
-    """The configuration of a saved policy, as its file has it; arguments as of :func:`load_policy`."""
+    """Return the configuration in a saved policy's file; arguments as for :func:`load_policy`."""
     return _read(_folder(place, revision=revision))[1]
 
 
 def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The configuration and weights to save, after checking that :func:`load_policy` could load them.
+    """Return configuration and weights to save, after checking that :func:`load_policy` could load them.
 
-    A ``TypeError`` or ``ValueError`` if not; also for before a training, whose policies would be lost.
+    Raises TypeError or ValueError if it could not; call it before a training whose result would be lost.
     """
     config = policy_config(actor)
     tensors = without_compilation(actor.state_dict())
     try:
-        with torch.random.fork_rng([]):  # as if nothing had been built
+        with torch.random.fork_rng([]):  # building a policy draws random weights
             again = policy_config(_filled(config, tensors))
         if changed := [name for name in config if config[name] != again[name]]:
             raise ValueError(f"its {changed[0]} would have {again[changed[0]]}, not {config[changed[0]]}")
     except Exception as error:
         raise ValueError(
-            f"the policy could not be loaded again: {error}. Constructors have to build, from the options in "
-            "config(), what is to be saved"
+            f"the policy could not be loaded again: {error}. Constructors must build the same object from "
+            "the options in config()"
         ) from error
     return config, tensors
 
 
 def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
-    """Write ``model.safetensors``, and a copy of the configuration in it as ``config.json`` for readers.
+    """Save a policy as ``model.safetensors``, with a readable copy of its configuration, ``config.json``.
 
-    Network, prior and normaliser each keep their precision. A digest lets :func:`load_policy` notice any
-    change. Saving over a policy leaves the old one or the new one, whatever happens meanwhile.
+    Network, prior and normaliser each keep their precision. :func:`load_policy` detects any change by a
+    digest. An interrupted save over a policy leaves either the old policy or the new one.
 
     Args:
         actor: the policy.
-        directory: created if needed.
+        directory: the folder; it is created if needed.
 
     Raises:
         OSError: if the folder cannot be written to.
         TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
-        ValueError: if the policy could not be loaded again, as is checked before.
+        ValueError: if the policy could not be loaded again, which is checked before writing.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -211,28 +213,28 @@ def push_policy(
     message: str = "Upload a policy of warmprior",
     token: str | None = None,
 ) -> str:
-    """Save the policy in a repository of the Hugging Face hub, which is made if needed.
+    """Save the policy in a repository on the Hugging Face hub, which is created if needed.
 
     Args:
         actor: the policy.
-        repository: such as ``"user/name"``.
+        repository: name of the repository, such as ``"user/name"``.
 
     Keyword Args:
-        card: text of its ``README.md``, such as :func:`~warmprior.training.model_card` writes; by
-            default what is there stays.
-        private: whether a new repository is private; by default what the account has set.
+        card: text of its ``README.md``, such as that of :func:`~warmprior.training.model_card`; by default
+            an existing one stays.
+        private: True for a new private repository; by default the account's setting.
         revision: branch; the main one by default.
-        message: of the commit.
-        token: with which to write; by default the hub client's own.
+        message: message of the commit.
+        token: token with write access; by default the hub client's own.
 
     Returns:
-        The commit, as ``revision`` of :func:`load_policy` takes it.
+        The hash of the commit, a ``revision`` for :func:`load_policy`.
 
     Raises:
         TypeError: see :func:`save_policy`.
-        ValueError: likewise; if the name is no ``"user/name"``; or if it is to be private, and there is a
-            public repository of that name.
-        OSError: the hub client's own, if the hub does not take it.
+        ValueError: see :func:`save_policy`; also if the name does not have the form ``"user/name"``, or
+            ``private`` is True and the repository exists and is public.
+        OSError: if the hub refuses the upload (the hub client's own error).
 
     Examples:
         >>> from warmprior.training import load_policy, model_card, push_policy
@@ -249,7 +251,7 @@ def push_policy(
             (folder / CARD).write_text(card)
         api.create_repo(repository, private=private, exist_ok=True)
         if private and not api.repo_info(repository).private:
-            raise ValueError(f"{repository} is public: choose another name, or make it private at the hub")
+            raise ValueError(f"{repository} is public: choose another name, or make it private on the hub")
         if revision is not None:
             api.create_branch(repository, branch=revision, exist_ok=True)
         sent = api.upload_folder(
@@ -268,22 +270,23 @@ def load_policy(
 ) -> WarmPriorActor:
     """Load a policy that :func:`save_policy` or :func:`push_policy` wrote; its chunks are bit-identical.
 
-    Nothing of it is run: weights are tensors, and the configuration names classes that are imported already.
+    No code in the file is run: weights are tensors, and the configuration names classes that must already be
+    imported.
 
     Args:
-        directory: where ``model.safetensors`` lies; or, as text, ``"user/name"`` of a
-            repository at the Hugging Face hub, where there is no such folder.
+        directory: the folder with ``model.safetensors``; or, if there is no such folder, a repository on the
+            Hugging Face hub, as text ``"user/name"``.
 
     Keyword Args:
-        device: where to put the weights.
-        generator: source of randomness of the sampler.
+        device: device of the weights.
+        generator: source of the sampler's randomness.
         revision: branch, tag or commit of the repository; its main branch by default.
-        token: for a private repository; by default the hub client's own.
+        token: token for a private repository; by default the hub client's own.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is damaged or of another format version; or if a revision of a folder is asked for.
-        OSError: if the hub does not have it, or does not give it to this user.
+        FileNotFoundError: if the folder has no policy.
+        ValueError: if the policy is damaged or has another format version, or a folder is given a revision.
+        OSError: if the hub does not have the policy, or this user has no access to it.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -298,7 +301,7 @@ def load_policy(
     tensors, config = _read(folder)
     try:
         actor = _filled(config, tensors)
-    except Exception as error:  # whatever options of another version lead to
+    except Exception as error:  # options of another version can raise anything
         reason = str(error) if type(error) is ValueError else repr(error)
         raise ValueError(f"the policy at {folder} cannot be built here: {reason}") from error
     actor.sampler.generator = generator
@@ -306,16 +309,16 @@ def load_policy(
 
 
 def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorActor:
-    """An actor of a configuration, with given weights, all of them finite."""
+    """Return the actor of a configuration, with these weights, all of which must be finite."""
     with _NoLargerThan(tensors):
         actor = _from_config(config)
     built = actor.state_dict()
     for name in sorted(built.keys() ^ tensors.keys()):
         raise ValueError(f"{name} is {'missing' if name in built else 'not part of it'}")
     for name, value in built.items():
-        mine, theirs = (f"{tuple(t.shape)} of {t.dtype}" for t in (value, tensors[name]))
-        if mine != theirs:
-            raise ValueError(f"{name} is {theirs}, not {mine}")
+        expected, stored = (f"{tuple(t.shape)} of {t.dtype}" for t in (value, tensors[name]))
+        if stored != expected:
+            raise ValueError(f"{name} is {stored}, not {expected}")
         if value.is_floating_point() and not torch.isfinite(tensors[name]).all():
             raise ValueError(f"{name} holds NaN or infinity")
     actor.load_state_dict(tensors)
@@ -323,35 +326,35 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
         if isinstance(module, (Normalizer, RestingAction, SourceMoments)):
             for name in module.positive:
                 if not (module.get_buffer(name) > 0).all():
-                    raise ValueError(f"{place}.{name} holds values that are not positive, and it is a scale")
+                    raise ValueError(f"{place}.{name} is a scale, but holds values that are not positive")
     return actor
 
 
 class _NoLargerThan(TorchDispatchMode):
-    """Stops what is built from options of a file once it is much larger than the weights beside them."""
+    """A limit on the size of parts built from a file's options: not much more than the file's weights."""
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         super().__init__()
-        # With room for what is built on the way, and for buffers that are not saved.
+        # With room for temporary tensors, and for buffers that are not saved.
         self.numbers = 2 * sum(value.numel() for value in tensors.values()) + 2**24
         self.count = 10 * len(tensors) + 1000
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         sizes: list[Any] = []
-        if func is torch.ops.aten.clone.default:  # by which layers are copied
+        if func is torch.ops.aten.clone.default:  # copies of layers
             sizes = [args[0].numel()]
-        elif not any(isinstance(value, Tensor) for value in args):  # it makes one, of a size among these
+        elif not any(isinstance(value, Tensor) for value in args):  # a new tensor; its size is among these
             sizes = [math.prod(value) if isinstance(value, (list, tuple)) else value for value in args]
         if sizes:
             self.numbers -= max((size for size in sizes if isinstance(size, int)), default=1)
             self.count -= 1
             if self.numbers < 0 or self.count < 0:
-                raise ValueError("its options ask for far more weights than it has")
+                raise ValueError("its options need far more weights than it has")
         return func(*args, **(kwargs or {}))
 
 
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
-    """An actor with fresh weights."""
+    """Return the actor of a configuration, with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
     for name, value in options.items():
         if name.endswith("_key"):
@@ -370,21 +373,21 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     parts = _parts(actor)
     for name, precision in config["precision"].items():
         dtype = getattr(torch, precision)
-        # Only then: a part may hold other types beside that of its weights.
+        # Only if it differs, because a part may also hold other types than that of its weights.
         if _dtype(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
 
 
 def _key(value: Any) -> NestedKey:
-    """A key of tensordicts, of which JSON holds nested ones as lists."""
+    """Return a tensordict's key from JSON, which holds nested keys as lists."""
     parts = value if isinstance(value, list) else [value]
     if not parts or not all(isinstance(part, str) for part in parts):
-        raise ValueError(f"{value!r} is no key")
+        raise ValueError(f"{value!r} is not a key")
     return tuple(value) if isinstance(value, list) else value
 
 
 def _dtype(part: nn.Module) -> torch.dtype | None:
-    """The precision of a part's weights; ``None`` if it has none."""
+    """Return the precision of a part's weights, or ``None`` if it has none."""
     tensors = chain(part.parameters(), part.buffers())
     return next((value.dtype for value in tensors if value.is_floating_point()), None)

@@ -1,4 +1,4 @@
-"""What policies are trained for: demonstrations, their units, and the environment that plays episodes."""
+"""Tasks: demonstrations, their units, and the environment that plays episodes."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.policy import policy_transforms
 
 NEAR = 0.2
-"""Share of the actions' variance that their distance from what they are targets of may have."""
+"""The largest distance of actions from the observed joints they set, as a share of the actions' variance."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """Demonstrations and an environment: what every policy of a comparison is trained for.
+    """A task: demonstrations, and the environment in which policies trained on them are played.
 
-    :meth:`of` takes raw demonstrations and a function that builds the environment, :meth:`open` a place.
+    Build one from raw demonstrations with :meth:`of`, or from a file or dataset with :meth:`open`.
 
     Attributes:
         name: short name, such as ``"square"``.
-        style: of the demonstrations, such as ``"ph"``.
+        style: style of the demonstrations, such as ``"ph"``.
         data: contiguous steps in normalised units, see :class:`~warmprior.ActionWindow`.
-        make_env: builds the environment, called without arguments to play episodes: a TorchRL environment
-            without batch dimensions, in raw units, with ``"observation"`` ``[d_o]`` and ``"action"``
-            ``[d_a]``, that starts the same episode after every ``set_seed(seed)``.
-        normalizer: between raw and normalised units; ``None`` if they are the same.
-        success: the environment's key for whether the task is solved, bool ``[1]``.
-        measures: further keys that episodes report, each with how its values are combined: ``"max"``,
-            ``"sum"`` or ``"last"``.
-        film_rate: control steps per second of films, where the environment has a method ``render`` that gives
-            a picture, uint8 ``[h, w, 3]``; ``None`` for no films, but robosuite's.
-        facts: what results say about the data, as JSON.
-        adapters: transforms next to the environment, as arguments of
+        make_env: builds the environment in which episodes are played, called without arguments: a TorchRL
+            environment without batch dimensions, in raw units, with ``"observation"`` ``[d_o]`` and
+            ``"action"`` ``[d_a]``, that starts the same episode after every ``set_seed(seed)``.
+        normalizer: converts between raw and normalised units; ``None`` if they are the same.
+        success: the environment's key of a flag that is True once the task is solved, bool ``[1]``.
+        measures: further keys that episodes report, each with the way in which its values are combined:
+            ``"max"``, ``"sum"`` or ``"last"``.
+        film_rate: control steps per second of videos. The environment then needs a method ``render`` that
+            returns a picture, uint8 ``[h, w, 3]``. ``None`` for no videos, except with robosuite.
+        facts: facts about the data for results, as JSON.
+        adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
-        rest: for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
-        clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for none.
-        environment: what a saved policy keeps of the environment, see
+        rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
+        clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for no bound.
+        environment: the description of the environment that a saved policy keeps, see
             :func:`~warmprior.envs.environment_of`.
-        digest: of the data; computed from them by default.
+        digest: digest of the data; computed by default.
 
     Raises:
-        ValueError: if ``name`` or ``style`` cannot be part of the name of a file, or for a measure that is
-            combined in another way.
+        ValueError: if ``name`` or ``style`` cannot be part of a file name, or a measure is combined in
+            another way.
 
     Examples:
         >>> import torch
@@ -91,7 +91,7 @@ class Task:
     def __post_init__(self) -> None:
         for part in (self.name, self.style):
             if Path(part).name != part:
-                raise ValueError(f"name and style become names of files: {part!r} cannot")
+                raise ValueError(f"name and style become parts of file names, which cannot hold {part!r}")
         for key, how in self.measures.items():
             check_choice(f"the measure {key!r}", how, ("max", "sum", "last"))
 
@@ -107,15 +107,15 @@ class Task:
         measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
         film_rate: int | None = None,
     ) -> Self:
-        """A task of your own, from raw demonstrations; the normaliser is fitted to them.
+        """Build a task from raw demonstrations; the normaliser is fitted to them.
 
-        Arguments are the attributes, but for the data: contiguous steps ``[N]`` in raw units, with
+        Arguments are as the attributes, except ``data``: contiguous steps ``[N]`` in raw units, with
         ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and ``"episode"``, an integer ``[N]``. With
-        images ``"observation"`` has the entries ``"state"`` ``[N, d_o]`` and each image, uint8
-        ``[N, 3, size, size]``. Without ``make_env`` policies are trained and not played.
+        images, ``"observation"`` has the entries ``"state"`` ``[N, d_o]`` and each image, uint8
+        ``[N, 3, size, size]``. Without ``make_env``, policies can be trained but not played.
 
         Raises:
-            KeyError: naming what the data lack.
+            KeyError: if the data lack an entry.
             ValueError: if an entry has another shape, or is not finite.
         """
         if data.ndim != 1:
@@ -125,12 +125,12 @@ class Task:
         vector: NestedKey = OBSERVATION
         if isinstance(data[OBSERVATION], TensorDictBase):
             vector = (OBSERVATION, STATE)
-            check_keys(data, [vector], f"the demonstrations of {name}", ", the robot's state beside images")
+            check_keys(data, [vector], f"the demonstrations of {name}", ", the robot's state next to images")
             for key, image in data[OBSERVATION].items():
                 if key != STATE and (image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3):
                     raise ValueError(
-                        f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, and images are "
-                        "uint8 [N, 3, size, size]"
+                        f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, but images must "
+                        "be uint8 [N, 3, size, size]"
                     )
         for key in (vector, ACTION):
             if data[key].ndim != 2:
@@ -174,42 +174,42 @@ class Task:
         horizon: int | None = None,
         **outcome: Any,
     ) -> Self:
-        """The demonstrations at a place, and the environment that recorded them if that is known.
+        """Build a task from a file or dataset, with the environment that recorded it if that is known.
 
         Args:
             place: a robomimic HDF5 file; ``lerobot:`` and the folder or repository of a LeRobotDataset; or
                 ``minari:`` and the name of a Minari dataset.
-            make_env: see :meth:`of`; instead of the recorded environment.
+            make_env: builds another environment than the recorded one, see :meth:`of`.
 
         Keyword Args:
-            task: of robosuite, for a LeRobotDataset that does not describe its environment.
-            style: of the demonstrations, which decides robosuite's time limit: ``"ph"`` by default, and
-                ``"human"`` elsewhere.
+            task: task of robosuite, for a LeRobotDataset that does not describe its environment.
+            style: style of the demonstrations, which decides robosuite's time limit: ``"ph"`` by default,
+                and ``"human"`` outside robosuite.
             observation_steps: ``To`` of the policies.
-            actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
-            observation_keys: observations to concatenate; the task's by default, or of a Minari dataset all.
-            joint_key: of these the one that actions are absolute targets of, number by number, such as the
-                positions of joints; actions beyond its width are none (see :meth:`with_joints`).
-            image_keys: images that policies see, beside the state of the robot, such as
-                ``"agentview_image"``; of a LeRobotDataset ``"front_image"`` is
+            actions: the policies' actions: pose deltas as recorded, or the absolute poses that these target.
+            observation_keys: observations to concatenate; by default the task's, or all of a Minari dataset.
+            joint_key: the observation whose numbers the actions set, one by one, such as joint positions;
+                actions beyond its width are not targets (see :meth:`with_joints`).
+            image_keys: images that policies see in addition to the robot's state, such as
+                ``"agentview_image"``; in a LeRobotDataset ``"front_image"`` stands for
                 ``"observation.images.front"``. None by default.
-            fast_rendering: whether the images are without reflections, shadows and smooth edges.
+            fast_rendering: True if the images have no reflections, shadows and smooth edges.
             mask: a mask of the file, such as ``"train"``.
-            demos: how many to take, from the first on; all by default.
+            demos: number of demonstrations to take, from the first on; all by default.
             horizon: control steps per episode; by default the environment's own, or that of the style.
-            **outcome: ``success``, ``measures`` and ``film_rate`` beside a ``make_env``, see :meth:`of`.
+            **outcome: ``success``, ``measures`` and ``film_rate``, only with a ``make_env``, see :meth:`of`.
 
         Raises:
             FileNotFoundError: if there is no such file or dataset.
-            DatasetError: if it is not as it should be, or its images are not what the simulator shows.
-            ValueError: if the file is of another task, or its actions are not near ``joint_key``.
+            DatasetError: if the data are invalid, or their images differ from the simulator's.
+            ValueError: if the file holds another task, or its actions are not near ``joint_key``.
 
         Examples:
             >>> from warmprior.training import Task
             >>> Task.open("square.hdf5", mask="train").name  # doctest: +SKIP
             'square'
         """
-        # Here, since training on a TensorDict needs no reader and no simulator.
+        # Imported here, since training on a TensorDict needs no reader and no simulator.
         from warmprior.data.images import renderer_versions
         from warmprior.data.opening import name_of_place
         from warmprior.envs.description import registered_description
@@ -217,37 +217,37 @@ class Task:
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.training import files
 
-        found = files.opened(place, task, mask)
-        image_keys = found.image_keys(image_keys)
-        index = found.index(observation_keys=observation_keys)
+        demonstrations = files.opened(place, task, mask)
+        image_keys = demonstrations.image_keys(image_keys)
+        index = demonstrations.index(observation_keys=observation_keys)
         if make_env is not None or not index.env_args:
             storage = "memmap" if image_keys else "memory"
             chosen: dict[str, Any] = {"observation_keys": observation_keys, "image_keys": image_keys}
-            replay = found.replay(demos=demos, storage=storage, **chosen)
+            replay = demonstrations.replay(demos=demos, storage=storage, **chosen)
             opened = cls.of(name_of_place(place), replay.data, make_env, style=style or "human", **outcome)
             if joint_key is not None:
                 opened = opened.with_joints(replay.joint_columns(joint_key))
-            said = opened.facts | {"source": "file", "file": found.name}
-            environment = None if make_env is not None or image_keys else found.environment()
+            facts: dict[str, Any] = opened.facts | {"source": "file", "file": demonstrations.name}
+            environment = None if make_env is not None or image_keys else demonstrations.environment()
             if environment is None:
-                return replace(opened, facts=said)
+                return replace(opened, facts=facts)
             environment |= {"observation_keys": list(index.observation_keys)}
             if horizon is not None:
                 environment["max_episode_steps"] = horizon
             description = registered_description(environment, observation_steps)
-            # Its wrappers are refused when it is built, which a training does not need.
+            # Unknown wrappers raise an error only when it is built, which a training does not need.
             recorded: Any = partial(registered_env, environment)
-            return replace(opened, facts=said, make_env=recorded, environment=description)
+            return replace(opened, facts=facts, make_env=recorded, environment=description)
         style, cameras = style or "ph", [key.removesuffix("_image") for key in image_keys]
         if demos == len(index.demos):
             demos = None  # all of them
         name = files.task_name(index)
-        if task not in (None, name):  # not after hours of training
+        if task not in (None, name):
             raise ValueError(f"{place} holds demonstrations of {name}, not of {task}: correct the task")
         if is_mimicgen(index.env_args["env_name"]):
             find_mimicgen()
         dataset, images = files.read_steps(
-            found,
+            demonstrations,
             absolute_actions=actions == "absolute",
             observation_keys=observation_keys,
             cameras=cameras,
@@ -262,29 +262,29 @@ class Task:
             actions=actions,
             horizon=horizon,
         )
-        sha256 = found.digest(observation_keys=observation_keys, image_keys=image_keys, demos=demos)
-        # Nothing is said of what is usual.
+        sha256 = demonstrations.digest(observation_keys=observation_keys, image_keys=image_keys, demos=demos)
+        # The default is left out.
         space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
         space |= {} if images is None else {"obs": "image", "images": images}
         space |= {} if observation_keys is None else {"observation_keys": list(observation_keys)}
-        facts: dict[str, Any] = {"source": "file", "file": found.name, "sha256": sha256}
+        facts = {"source": "file", "file": demonstrations.name, "sha256": sha256}
         facts |= {"demonstrations": dataset.num_episodes, "steps": len(dataset.data), **space}
-        # Images are drawn by what is installed.
+        # Images depend on the installed renderer.
         digest = digest_of(sha256, demos, space, images and renderer_versions())
         made = cls(name, style, facts=facts, digest=digest, **recorded)
         return made if joint_key is None else made.with_joints(dataset.joint_columns(joint_key))
 
     def with_joints(self, columns: Sequence[int]) -> Self:
-        """The task whose actions are absolute targets of what is observed, such as the positions of joints.
+        """Return a task whose actions are absolute targets for observed numbers, such as joint positions.
 
-        A preconditioned network then learns where to go from there (:class:`~warmprior.RestingJoints`).
+        A preconditioned network then learns the motion from there (:class:`~warmprior.RestingJoints`).
 
         Args:
-            columns: for each action the number of the observation that it is a target of, in the same units;
-                -1 for an action that is none.
+            columns: for each action the index in the observation of the number that it sets, in the same
+                units; -1 for an action that is not a target.
 
         Raises:
-            ValueError: if there is no such number, or actions do not follow them.
+            ValueError: if an index is out of range, or actions are not near the numbers they set.
 
         Examples:
             >>> import torch
@@ -301,25 +301,25 @@ class Task:
         actions, width = self.data[ACTION], self.vector.shape[-1]
         if self.rest is not None or self.normalizer is None:
             raise ValueError(
-                f"{self.name} has a resting action already, or no normaliser: joints are of actions as they "
-                "were recorded (leave out actions='absolute')"
+                f"{self.name} has a resting action already, or no normaliser: joint targets need the "
+                "recorded actions (leave out actions='absolute')"
             )
         check_whole_numbers(-1, **{f"column {i}": column for i, column in enumerate(columns)})
         if len(columns) != actions.shape[-1] or not -1 < max(columns) < width:
             raise ValueError(
-                f"columns are {actions.shape[-1]} numbers from -1 to {width - 1}, not all of them -1: got "
+                f"columns must be {actions.shape[-1]} numbers from -1 to {width - 1}, not all -1, got "
                 f"{columns}"
             )
         rest = RestingJoints(torch.tensor(columns), self.normalizer)
-        # Joints may hang below their targets, and a single one may move as little as its noise.
+        # All targets together: joints may sag below their targets, and one may move less than its noise.
         targets = torch.tensor([column >= 0 for column in columns])
         off = (actions - rest(self.vector)).var(0, correction=0)[targets]
         spread = actions.var(0, correction=0)[targets]
         if off.sum() > NEAR * spread.sum():
             worst = int(targets.nonzero()[(off / spread.clamp_min(VARIANCE_FLOOR)).argmax()])
             raise ValueError(
-                f"actions of {self.name} are not near what they are to be targets of, action {worst} least "
-                f"(number {columns[worst]} of the observation): name it in the same order and units"
+                f"actions of {self.name} are not near the observed numbers they should set, least of all "
+                f"action {worst} (number {columns[worst]} of the observation): use the same order and units"
             )
         return replace(self, rest=rest)
 
@@ -332,16 +332,16 @@ class Task:
         delay: int | None = None,
         **options: Any,
     ) -> TransformedEnv:
-        """The environment as a policy is played in it: ``base``, or what ``make_env(**options)`` builds.
+        """Return the environment with a policy's transforms.
 
         Args:
             policy: the policy, or its prior.
-            base: an environment of the task.
+            base: an environment of the task; by default the one that ``make_env(**options)`` builds.
 
         Keyword Args:
             execute: see :func:`~warmprior.policy_transforms`.
-            delay: likewise.
-            **options: of ``make_env``.
+            delay: see :func:`~warmprior.policy_transforms`.
+            **options: options of ``make_env``.
         """
         transforms = policy_transforms(
             policy,
@@ -352,41 +352,41 @@ class Task:
             success=self.success,
             measures=self.measures,
         )
-        # An environment may have transforms of its own; they stay inside.
+        # auto_unwrap=False, because the environment's own transforms must stay inside.
         return TransformedEnv(base or self.make_env(**options), transforms, auto_unwrap=False)
 
     def check_environment(self, **options: Any) -> None:
-        """Build the environment, reset it and step once with a recorded action; nothing is trained.
+        """Build the environment, reset it and step once with a recorded action, without training.
 
         Args:
-            **options: of ``make_env``.
+            **options: options of ``make_env``.
 
         Raises:
             ImportError: if the environment is not installed.
-            ValueError: if it cannot be played, or is not that of the demonstrations.
+            ValueError: if the environment cannot be played, or does not fit the demonstrations.
         """
         env: EnvBase | None = None
         try:
             env = base = self.make_env(**options)
             env = self.env(GaussianPrior(1), base)
-            known = list(base.observation_spec.keys(True, True))
+            present = list(base.observation_spec.keys(True, True))
             for key in (self.success, *self.measures):
-                if key not in known:
-                    raise ValueError(f"it does not write {key!r} beside its reward: it writes {known}")
+                if key not in present:
+                    raise ValueError(f"it does not write {key!r} next to its reward: it writes {present}")
             widths = {"observation": self.vector.shape[-1], "action": self.data[ACTION].shape[-1]}
             specs = {"observation": base.observation_spec, "action": env.full_action_spec}
             for (name, width), place in zip(widths.items(), (OBSERVATION, CHUNK), strict=True):
                 spec = specs[name]
-                theirs = spec[place].shape[-1:] if place in spec.keys(True, True) else None
-                if theirs != (width,):
+                shape = spec[place].shape[-1:] if place in spec.keys(True, True) else None
+                if shape != (width,):
                     raise ValueError(
-                        f"its {name!r} has the width {theirs}, and that of its demonstrations {width}"
+                        f"its {name!r} has the width {shape}, but that of the demonstrations is {width}"
                     )
             env.set_seed(0)
             env.step(env.reset().set(CHUNK, self.data[ACTION][:1].to("cpu")))
         except ImportError:
             raise
-        except Exception as error:  # of a simulator, or of code of a user's
+        except Exception as error:  # the simulator or the user's code can raise anything
             reason = error.args[0] if isinstance(error, KeyError) and error.args else error
             file = f" ({self.facts['file']})" if "file" in self.facts else ""
             raise ValueError(
@@ -397,9 +397,9 @@ class Task:
                 env.close()
 
     def split(self, held_out: int) -> tuple[Self, TensorDictBase | None]:
-        """The task without its last demonstrations, and their normalised steps; units are those of all.
+        """Return the task without its last demonstrations, and their normalised steps, in unchanged units.
 
-        A ``ValueError`` if none would be left.
+        Raises ValueError if no demonstration would be left.
         """
         check_whole_numbers(0, held_out=held_out)
         if not held_out:
@@ -416,11 +416,11 @@ class Task:
 
     @cached_property
     def identity(self) -> str:
-        """Digest of the data, part of the identity of every policy that is trained on them."""
+        """A digest of the data, part of the identity of every policy trained on them."""
         joints = [self.rest.columns.tolist()] if isinstance(self.rest, RestingJoints) else []
         if self.digest:
             return digest_of(self.digest, joints) if joints else self.digest
-        # Data in other units may be equal once they are normalised.
+        # Data in other units may be equal after normalisation.
         units = self.normalizer.state_dict() if self.normalizer else {}
         data = data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
         return digest_of(data, {key: value.tolist() for key, value in units.items()}, *joints)
@@ -433,7 +433,7 @@ class Task:
 
     @property
     def images(self) -> dict[str, int]:
-        """Names of the observation's images, and their sides in pixels."""
+        """The names of the observation's images, and their sides in pixels."""
         observation = self.data[OBSERVATION]
         if not isinstance(observation, TensorDictBase):
             return {}

@@ -1,4 +1,4 @@
-"""From a task and a source to a trained policy: preconditioning, fresh weights and behaviour cloning."""
+"""Training of a policy for a task and a source: preconditioning, fresh weights and behaviour cloning."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def new_policy(
     see_history: bool = False,
     **sampling: Any,
 ) -> WarmPriorActor:
-    """A policy with fresh weights, which depend on the training's seed alone; see :func:`train_policy`."""
+    """Return a policy with fresh weights, which depend only on the seed; see :func:`train_policy`."""
     action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
     if see_history:
         observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
@@ -68,7 +68,7 @@ def new_policy(
         **sampling,
         clip=task.clip,
         observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
-        # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
+        # A copy, because the policy moves to the device and the environments' normaliser stays on the CPU.
         normalizer=copy.deepcopy(task.normalizer),
         environment=task.environment,
     )
@@ -94,43 +94,43 @@ def train_policy(
     progress: Callable[[int], object] | None = None,
     **sampling: Any,
 ) -> WarmPriorActor:
-    """From demonstrations and a source to a trained policy, by behaviour cloning.
+    """Train a policy on demonstrations with a source, by behaviour cloning.
 
-    The defaults are what the tables here were measured with: a :class:`VelocityMLP` that is preconditioned
-    for the source and the demonstrations, and the recipe of :class:`TrainingConfig`. On a CPU one thread
-    trains: another number would give other weights.
+    The defaults are those of the documentation's tables: a :class:`VelocityMLP` that is preconditioned for
+    the source and the demonstrations, and the recipe of :class:`TrainingConfig`. CPU training uses one thread
+    so that results are reproducible.
 
     Args:
         demonstrations: a place that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
             ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
             them, as :meth:`Task.of` takes them; or a :class:`Task`.
         prior: the source distribution.
-        directory: where the training is saved, and continued from, see :class:`BehaviourCloning`; nowhere by
-            default, so that an interruption loses it.
+        directory: folder in which the training is saved, and from which it continues, see
+            :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training is lost.
 
     Keyword Args:
-        observation_keys: of a place, see :meth:`Task.open`.
-        image_keys: likewise.
+        observation_keys: observations to read from a place, see :meth:`Task.open`.
+        image_keys: images to read from a place, see :meth:`Task.open`.
         nfe: network evaluations per chunk, saved with the policy; 3 by default.
-        network: the velocity network.
+        network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
-        start: where samplers start; at the source by default.
-        coupling: how sources and targets are paired; as they come by default.
-        see_history: whether the network sees the last actions.
-        device: of the network and, where they fit, the demonstrations.
-        compile: compile the network with :func:`torch.compile`.
+        start: the point from which integration starts; the source sample by default.
+        coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`; in order by default.
+        see_history: True if the network sees the last actions.
+        device: device of the network and, if they fit, the demonstrations.
+        compile: True compiles the network with :func:`torch.compile`.
         logger: a TorchRL logger, closed at the end.
-        description: of the progress bar; no bar if ``None``.
-        progress: called with the number of iterations, at the start and after each.
+        description: label of the progress bar; no bar if ``None``.
+        progress: called with the number of iterations, at the start and after each iteration.
         **sampling: further options of :class:`~warmprior.Sampling`, saved with the policy, such as
             ``max_nfe`` for a field that is trained at few times.
 
     Returns:
-        The last policy of averaged weights, on the CPU, with the demonstrations' normaliser.
-        :func:`~warmprior.policy_transforms` makes the environment that it acts in.
+        The last policy, with averaged weights, on the CPU, with the demonstrations' normaliser. Use
+        :func:`~warmprior.policy_transforms` to build the environment that it acts in.
 
     Raises:
-        TypeError: if the demonstrations or the prior are something else.
+        TypeError: if the demonstrations or the prior have another type.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
         ValueError: if the demonstrations have another form, or the folder holds another training.
@@ -151,10 +151,10 @@ def train_policy(
     """
     network, training = network or NetworkOptions(), training or TrainingConfig()
     if not isinstance(prior, Prior):
-        raise TypeError(f"the prior is an object such as PastPrior(8), got {prior!r}")
+        raise TypeError(f"the prior must be an object such as PastPrior(8), got {prior!r}")
     place = isinstance(demonstrations, str | Path)
     if not place and (observation_keys is not None or image_keys):
-        raise ValueError("observation_keys and image_keys choose what is read of a file or dataset")
+        raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
     if isinstance(demonstrations, str | Path):
         task = Task.open(
             demonstrations,
@@ -177,10 +177,10 @@ def train_policy(
         raise ValueError("processes that train together need a directory that all of them see")
     with ExitStack() as stack:
         stack.enter_context(torch_threads(1 if on_cpu else None))
-        # The training seeds PyTorch's global generator, and gives it back as it was.
+        # The training seeds PyTorch's global generator, whose state is restored at the end.
         on_gpu = torch.device(device).type == "cuda"
         stack.enter_context(torch.random.fork_rng([torch.device(device)] if on_gpu else []))
-        if logger is not None:  # a process may end without the exit handlers that some loggers write in
+        if logger is not None:  # some loggers write in exit handlers, which a killed process does not run
             stack.enter_context(closing(logger))  # type: ignore[type-var]
         if directory is None:
             directory = stack.enter_context(TemporaryDirectory())
@@ -206,12 +206,12 @@ def train_policy(
             compile=compile,
         )
         cloning.run(description, progress)
-        from_leader(lambda: None)  # other processes wait until the first has written it
+        from_leader(lambda: None)  # other processes wait until the first has written the policy
         return load_policy(cloning.policy_path())
 
 
 TREND_BATCHES = 16
-"""Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
+"""The number of batches of 1,024 windows to which a :class:`PoseTrend` is fitted."""
 
 
 def precondition(
@@ -225,9 +225,9 @@ def precondition(
     rest: RestingAction | None = None,
     interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
-    """Wrap a network in what is known of a prior's source and the demonstrations before any training.
+    """Wrap a network in a :class:`~warmprior.PreconditionedNetwork` for a prior and demonstrations.
 
-    The same data and prior give the same.
+    No training is needed. The result is deterministic: equal data and prior give an equal wrapper.
 
     Args:
         network: the network to wrap.
@@ -236,10 +236,10 @@ def precondition(
 
     Keyword Args:
         observation_steps: ``To``.
-        coupling: how the training pairs sources and targets; as they come by default.
+        coupling: pairs sources and targets, as the training does; in order by default.
         withhold: share of the windows whose history is withheld.
-        rest: for absolute actions, to take off what follows from where the grippers are.
-        interpolant: the path, that of the loss; linear by default.
+        rest: the resting action, for absolute actions; the network then learns the motion from there.
+        interpolant: the path of the loss; linear by default.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
@@ -251,7 +251,7 @@ def precondition(
         'PreconditionedNetwork'
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
-    if coupling is None:  # which may look at them
+    if coupling is None:  # a coupling may read the images
         data = without_images(data)
     windows = window_replay_buffer(
         data,
