@@ -1,4 +1,4 @@
-"""Demonstrations as one TensorDict of steps: files of robomimic, and datasets of LeRobot and Minari."""
+"""Demonstrations as one TensorDict of steps, from robomimic files and LeRobot and Minari datasets."""
 
 from __future__ import annotations
 

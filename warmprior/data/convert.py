@@ -1,4 +1,4 @@
-"""Turns demonstrations in robomimic's layout into a LeRobotDataset v3."""
+"""Conversion of demonstrations in robomimic's layout to a LeRobotDataset v3."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from warmprior.io.files import check_writable, exclusive, file_digest, write_ato
 from warmprior.keys import ACTION, OBSERVATION, STATE
 
 KINDS = ("image", "video")
-VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
+VIDEO_SIZE = 32  # the smallest side in pixels; the AV1 encoder ends the process below it
 
 
 def convert_robomimic(
@@ -39,27 +39,26 @@ def convert_robomimic(
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
-    :doc:`/data` has a table of what becomes what. Numbers become float32. The first simulator state is kept,
-    by which images are compared with the simulator's before a training. The folder, which is returned,
-    appears under its name when it is complete; an interrupted call leaves nothing.
+    :doc:`/data` has a table of all entries and features. Numbers become float32. The first simulator state is
+    kept, so that images can be compared with the simulator's before a training. The folder, which is
+    returned, is written atomically: an interrupted call leaves nothing.
 
     Args:
         path: a robomimic HDF5 file, such as one of scripted demonstrations.
-        folder: where to write; must not exist.
+        folder: the folder to write; it must not exist.
 
     Keyword Args:
-        images: write those of the file as well, as pictures (``"image"``, lossless PNG) or as videos
-            (``"video"``, lossy, smaller).
-        demos: how many to convert, the first ones by their numbers; all if ``None``.
-        observation_keys: the observations to write; by default the task's. Others are to be named again when
-            the dataset is opened.
+        images: format of the file's images, if they are written too: pictures (``"image"``, lossless PNG) or
+            videos (``"video"``, lossy, smaller).
+        demos: number of demos to convert, the first ones by their numbers; all if ``None``.
+        observation_keys: observations to write; by default the task's. If they differ from these, name them
+            again when opening the dataset.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileExistsError: if there is something at ``folder``.
-        DatasetError: if the file is not as it should be, does not describe its environment, or has no images
-            to write.
-        ValueError: if ``images`` is unknown, or the file's are too small for a video.
+        FileExistsError: if ``folder`` exists.
+        DatasetError: if the file is invalid, does not describe its environment, or has no images to write.
+        ValueError: if ``images`` is unknown, or the file's images are too small for a video.
         OSError: if the disk is full, or another process converts to the same folder.
 
     Examples:
@@ -83,11 +82,11 @@ def convert_robomimic(
         check_choice("images", images, KINDS)
         keys = [f"{camera}_image" for camera in index.cameras]
         if not keys:
-            raise DatasetError(f"{path} has no images: render them first, or take images=None")
+            raise DatasetError(f"{path} has no images: render them first, or use images=None")
         index = read_index(path, image_keys=keys, **chosen)
         side = index.image_size
         if images == "video" and side < VIDEO_SIZE:
-            raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; take images='image'")
+            raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; use images='image'")
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} exists: choose another folder, or remove it")
     fps = index.env_args["env_kwargs"].get("control_freq", 20)
@@ -99,7 +98,7 @@ def convert_robomimic(
     with exclusive(parts):
         whole = parts / folder.name
         try:
-            # What a killed process left is of no use: its files have no ends.
+            # The files that a killed process left are incomplete.
             shutil.rmtree(whole, ignore_errors=True)
             _write(datasets, index, whole, int(fps), images)
             os.rename(whole, folder)
@@ -176,10 +175,10 @@ def _write(
                     for key in index.image_keys:
                         frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
                     dataset.add_frame(frame | {"task": task})
-                # In parallel every camera of every episode would start a process that imports LeRobot.
+                # Parallel encoding would start a process, which imports LeRobot, per camera and episode.
                 dataset.save_episode(parallel_encoding=False)
         except BaseException:
-            # Left to the garbage collector, its files would appear once the folder is gone.
+            # Without this, the garbage collector would write its files after the folder is removed.
             with suppress(Exception):
                 dataset.finalize()
             raise
@@ -189,16 +188,16 @@ def _write(
 
 
 def _outcome(data: TensorDictBase, index: DatasetIndex) -> dict[str, torch.Tensor]:
-    """What is known of the episodes: rewards that are all zero say nothing, nor that the task failed."""
+    """Return the features of the outcome; rewards that are all zero tell neither success nor failure."""
     reward = data["next", "reward"]
     success = solved(reward, index.env_args)
-    known = {"next.done": data["next", "done"]}
-    known |= {REWARD: reward} if reward.any() else {}
-    return known | ({SUCCESS: success} if success.any() else {})
+    features = {"next.done": data["next", "done"]}
+    features |= {REWARD: reward} if reward.any() else {}
+    return features | ({SUCCESS: success} if success.any() else {})
 
 
 def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
-    """What LeRobot's own files do not tell."""
+    """Return the facts for which LeRobot's own files have no place."""
     observations: dict[str, tuple[str, int, int]] = {}
     for feature, widths in layout.items():
         borders = pairwise(np.cumsum([0, *widths.values()]).tolist())
@@ -229,7 +228,7 @@ def quietly() -> Iterator[None]:
     linux = hasattr(os, "sched_setscheduler")
     scheduled = (os.sched_getscheduler(0), os.sched_getparam(0)) if linux else None
     try:
-        os.environ.setdefault("SVT_LOG", "1")  # of the encoder's messages errors alone
+        os.environ.setdefault("SVT_LOG", "1")  # the encoder prints errors only
         with utils.SuppressProgressBars():
             yield
     finally:

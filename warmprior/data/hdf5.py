@@ -1,7 +1,7 @@
-"""Reading robomimic's HDF5 layout, with errors that say which demo, key and row is wrong.
+"""A reader of robomimic's HDF5 layout, with errors that say which demo, key and row is wrong.
 
-A file can name other files of the machine as its contents, and declare more than it stores, which HDF5 reads
-as zeros. Everything here is opened by :func:`member`, which refuses both.
+A file can refer to other files on the machine for its contents, and declare more than it stores, which HDF5
+reads as zeros. Everything here is opened by :func:`member`, which refuses both.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ if TYPE_CHECKING:
     import h5py
 
 
-CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, however few rows are asked for
+CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, even to read a few rows
 _MAX_SOFT_LINKS = 16
 _AGAIN = "Copy or download it again."
-_COPY = "That one is not read: copy the data into this file."
+_COPY = "Other files are not read: copy the data into this file."
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
-_OBSERVE = "take the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
+_OBSERVE = "use the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
 
 
 @contextmanager
 def reading(parent: h5py.Group, name: str) -> Iterator[None]:
-    """Name the file, and the object below ``parent``, in whatever goes wrong inside."""
+    """Turn any error inside into a DatasetError that names the file and the object below ``parent``."""
     try:
         yield
     except DatasetError:
@@ -57,18 +57,18 @@ def reading(parent: h5py.Group, name: str) -> Iterator[None]:
 
 
 def names(group: h5py.Group) -> list[str]:
-    """The names in a group, sorted, each once."""
+    """Return the names in a group, sorted, and check that each occurs once."""
     with reading(group, ""):
-        found = sorted(group)
-    if twice := [name for name, following in pairwise(found) if name == following]:
+        listed = sorted(group)
+    if twice := [name for name, following in pairwise(listed) if name == following]:
         raise DatasetError(f"{_place(group)} has the name {twice[0]!r} twice, so another is lost. {_AGAIN}")
-    return found
+    return listed
 
 
 def member(
     parent: h5py.Group, name: str, kind: Literal["group", "dataset"]
 ) -> h5py.Group | h5py.Dataset | None:
-    """Open a group or dataset that the file itself holds, and has written, below ``parent``; or ``None``."""
+    """Open a group or dataset below ``parent`` that is fully stored in this file; ``None`` without one."""
     with reading(parent, name):
         item = _follow(parent, name, _MAX_SOFT_LINKS)
         if item is None:
@@ -88,7 +88,7 @@ def _place(parent: h5py.Group, name: str = "") -> str:
 
 
 def _follow(node: h5py.Group, name: str, soft_links: int) -> h5py.Group | h5py.Dataset | None:
-    # Link by link, by the low-level calls: h5py's own, ``in`` included, would open the other file.
+    # Links are followed one by one, with low-level calls: h5py's own, even ``in``, would open other files.
     h5py = require("h5py", "sim")
     for part in name.strip("/").split("/"):
         if not isinstance(node, h5py.Group):
@@ -114,13 +114,13 @@ def _follow(node: h5py.Group, name: str, soft_links: int) -> h5py.Group | h5py.D
 
 
 def _check_stored(dataset: h5py.Dataset) -> None:
-    """Whether a dataset's values are all in this file, and can be read within bounds."""
+    """Raise DatasetError unless a dataset's values are all in this file, and can be read within bounds."""
     what = _place(dataset)
     if dataset.is_virtual or dataset.external:
         raise DatasetError(f"{what} has its values in another file. {_COPY}")
     if not dataset.size:
         return
-    places: list[tuple[int, int]] = []  # in the file, of the stored parts: first byte and size
+    places: list[tuple[int, int]] = []  # first byte and size of each stored part in the file
     if dataset.chunks is None:
         stored = dataset.id.get_storage_size()
         complete = stored >= dataset.size * dataset.dtype.itemsize
@@ -136,22 +136,22 @@ def _check_stored(dataset: h5py.Dataset) -> None:
             parts: dict[tuple[int, ...], tuple[int, int]] = {}
             dataset.id.chunk_iter(lambda p: parts.update({p.chunk_offset: (p.byte_offset, p.size)}))
             places = sorted(parts.values())
-            # HDF5 reads a part that its index does not find as zeros.
+            # HDF5 reads a part that is missing in its index as zeros.
             if not all(start in parts for start in product(*(range(0, n, c) for n, c in steps))):
                 raise DatasetError(f"{what}: its index of chunks is damaged. {_AGAIN}")
     ends = [*(first for first, _ in places[1:]), dataset.file.id.get_filesize()]
     if any(first + size > end for (first, size), end in zip(places, ends, strict=bool(places))):
-        raise DatasetError(f"{what}: its values overlap, or lie behind the file's end. {_AGAIN}")
+        raise DatasetError(f"{what}: its values overlap, or lie after the file's end. {_AGAIN}")
     if not complete:
         raise DatasetError(f"{what} has values that were never written. {_LEAVE_OUT}")
 
 
-_IMAGE_BYTES = 2**24  # of images read at once
+_IMAGE_BYTES = 2**24  # bytes of images that are read at once
 
 
 @contextmanager
 def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
-    """Open a robomimic file for reading; a ``DatasetError`` if it is not whole or has no demos."""
+    """Open a robomimic file for reading; raise DatasetError if it is incomplete or has no demos."""
     h5py = require("h5py", "sim")
     path = Path(path)
     if path.is_dir():
@@ -166,7 +166,7 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
             "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
         ) from error
     except PermissionError:
-        raise PermissionError(f"{path}: it may not be read here: change its permissions") from None
+        raise PermissionError(f"{path}: no permission to read it: change its permissions") from None
     except OSError as error:
         size = path.stat().st_size
         raise DatasetError(f"{path}: not a readable HDF5 file ({size} bytes; {error}). {_AGAIN}") from error
@@ -196,7 +196,7 @@ def _mask(file: h5py.File, filter_key: str) -> set[str]:
     entries, demos = member(file["mask"], filter_key, "dataset"), len(names(file["data"]))
     what = f"{file.filename}: mask/{filter_key}"
     if entries is None or entries.ndim != 1 or entries.dtype.kind not in "SO":
-        raise DatasetError(f"{what} is no list of names of demos, but {entries}; rebuild the mask")
+        raise DatasetError(f"{what} is not a list of names of demos, but {entries}; rebuild the mask")
     if len(entries) > demos:
         raise DatasetError(f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask")
     with reading(file, f"mask/{filter_key}"):
@@ -214,30 +214,30 @@ def selected_demos(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
     for name in selected:
         if not (name.startswith("demo_") and name[5:].isdecimal()):
             raise DatasetError(f"{file.filename}: data/{name} is not called demo_<number>; rename the group")
-    return tuple(sorted(selected, key=lambda name: int(name[5:])))  # not zero padded: 10 comes after 9
+    return tuple(sorted(selected, key=lambda name: int(name[5:])))  # by number: names have no leading zeros
 
 
 def read_described(file: h5py.File, name: str) -> Any:
-    """Read an attribute of the demos, which is JSON; ``None`` if there is none."""
+    """Read a JSON attribute of the demos, or return ``None`` if there is none."""
     with reading(file, f"data.attrs[{name!r}]"):
         attributes = file["data"].attrs
         return json.loads(attributes[name]) if name in attributes else None
 
 
 def _check_total(file: h5py.File, steps: int) -> None:
-    """Compare the steps of all demos with what the file counts, if it does: damage can hide a demo."""
+    """Compare the steps of all demos with the file's own count, if it has one: damage can hide a demo."""
     with reading(file, "data.attrs['total']"):
         total = file["data"].attrs.get("total")
         differs = total is not None and int(total) != steps
     if differs:
         raise DatasetError(
-            f"{file.filename}: data.attrs['total'] counts {total} steps, and the demos have {steps}: one is "
-            "lost, or not whole. Copy or download it again, or correct the attribute."
+            f"{file.filename}: data.attrs['total'] counts {total} steps, but the demos have {steps}: one is "
+            "missing or incomplete. Copy or download it again, or correct the attribute."
         )
 
 
 def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
-    """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
+    """Return the rendering options of a file's images, and a demo's first simulator state, if present."""
     with open_robomimic(path) as file:
         rendering = read_described(file, "rendering")
         states = member(file, f"data/{demo}/states", "dataset")
@@ -254,11 +254,11 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
         raise DatasetError(f"{what} has no group 'obs': it holds no observations: {_OBSERVE}")
     for key in ("actions", "rewards", *keys):
         dataset = member(demo, key, "dataset")
-        if dataset is None and key == "rewards":  # which cloning does not need
+        if dataset is None and key == "rewards":  # cloning needs no rewards
             continue
         if dataset is None:
-            kind, found = ("observation", observations) if key.startswith("obs/") else ("dataset", demo)
-            raise unknown(what, kind, key.removeprefix("obs/"), names(found))
+            kind, group = ("observation", observations) if key.startswith("obs/") else ("dataset", demo)
+            raise unknown(what, kind, key.removeprefix("obs/"), names(group))
         shape: tuple[int, ...] = dataset.shape or ()
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0 or shape[:1] != (steps,):
@@ -271,7 +271,7 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
 
 
 def _is_vector(observations: h5py.Group, key: str) -> bool:
-    """Whether an observation holds a number, or a vector of them, per step."""
+    """Return True if an observation holds a number or a vector of numbers per step."""
     with reading(observations, key):
         item = _follow(observations, key, _MAX_SOFT_LINKS)
         return (
@@ -282,7 +282,7 @@ def _is_vector(observations: h5py.Group, key: str) -> bool:
 
 
 def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int, str]:
-    """Return the sides in pixels of a demo's images, after checking that they are what they should be."""
+    """Return the sides in pixels of a demo's images, after checking their shapes and types."""
     sizes = {}
     for key in keys:
         what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
@@ -290,7 +290,7 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
             others = [name for name in names(demo["obs"]) if name.endswith("_image") and name != key]
             if not others:
                 raise DatasetError(
-                    f"{_place(demo)} has no images: leave image_keys out, or render them of its states "
+                    f"{_place(demo)} has no images: leave image_keys out, or render them from its states "
                     "(python benchmarks/demonstrations.py render)"
                 )
             raise unknown(_place(demo), "images", key, others)
@@ -312,7 +312,7 @@ def read_index(
     poses: bool = False,
     demos: int | None = None,
 ) -> DatasetIndex:
-    """Say what a robomimic file holds, by names, shapes and attributes alone; errors name what is wrong.
+    """Return the index of a robomimic file, from its names, shapes and attributes alone.
 
     Options are those of :class:`~warmprior.data.RobomimicDemonstrations`; ``poses`` also requires the hand
     pose of every arm.
@@ -330,7 +330,7 @@ def read_index(
                 f"{path}: its demos have no group 'obs': recordings of robosuite hold states without "
                 f"observations: {_OBSERVE}"
             )
-        # Of a robot, or a simulator, that is none of robosuite's.
+        # A file without a description comes from a robot, or from another simulator than robosuite.
         env_args = {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
         task = task_of_env(env_args) if env_args else None
         if observation_keys is not None:
@@ -338,9 +338,9 @@ def read_index(
         elif task is not None:
             keys = task.low_dim_keys
         else:
-            known = [key for key in low_dim_keys(arms=2) if key in available]
-            others = [key for key in available if key not in known and not key.startswith("robot")]
-            keys = (*known, *(key for key in others if _is_vector(observations, key)))
+            usual = [key for key in low_dim_keys(arms=2) if key in available]
+            others = [key for key in available if key not in usual and not key.startswith("robot")]
+            keys = (*usual, *(key for key in others if _is_vector(observations, key)))
         wanted = [f"obs/{key}" for key in keys]
         if poses:
             actions = member(file, f"data/{selected[0]}/actions", "dataset")
@@ -356,7 +356,7 @@ def read_index(
         sides: dict[int, str] = {}
         for name in selected:
             demo = member(file["data"], name, "group")
-            if demo is None:  # listed, but not to be found: its index is damaged
+            if demo is None:  # the name is listed, but a damaged index hides the demo
                 raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
             steps, widths = _widths(demo, wanted)
             if lengths and widths.keys() != expected.keys():
@@ -389,7 +389,7 @@ def read_index(
 
 
 class RobomimicReader(DemonstrationReader):
-    """The values of an open file."""
+    """A reader of an open file's values."""
 
     def __init__(self, file: h5py.File) -> None:
         self.file = file
@@ -420,5 +420,5 @@ class RobomimicReader(DemonstrationReader):
                 target[start : start + rows] = images[start : start + rows].transpose(0, 3, 1, 2)
 
     def name(self, demo: str, key: str) -> str:
-        """What errors call an array of a demo."""
+        """Return the name of a demo's array for errors."""
         return f"{self.file.filename}: data/{demo}/{key}"

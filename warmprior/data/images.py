@@ -1,4 +1,4 @@
-"""Whether the images of demonstrations show what the simulator shows."""
+"""A comparison of demonstrations' images with those of the simulator."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from warmprior.envs.simulator import check_scene_stays, make_simulator
 from warmprior.keys import OBSERVATION
 
 RENDERER_VERSION = 2
-"""Part of what images depend on; raised whenever the same states give other ones."""
+"""The version of rendering here; it is raised whenever the same states give other images."""
 
 CLEARLY = 8.0
-"""Mean difference of two images, of 255, from which on they show something else."""
+"""The mean difference of two images, out of 255, above which they show different things."""
 
 
 def renderer_versions() -> tuple[int | str, ...]:
-    """What the same states' images depend on, beside how they are asked for."""
+    """Return the versions on which images of the same states depend, in addition to the options."""
     return RENDERER_VERSION, version("mujoco"), version("robosuite")
 
 
 class StateRenderer:
-    """Renders the states of demonstrations; its simulator is made when it is first needed."""
+    """A renderer of demonstrations' states; it builds its simulator when first needed."""
 
     def __init__(self, index: DatasetIndex, size: int, fast: bool) -> None:
         self.index, self.size, self.fast = index, size, fast
 
     @cached_property
     def renderer(self) -> CameraRenderer:
-        """Of the simulator's model, in which nothing may depend on a reset."""
+        """The renderer of the simulator's model, in which nothing may depend on a reset."""
         env = make_simulator(modernize_env_args(self.index.env_args))
         try:
             check_scene_stays(env)
@@ -48,14 +48,14 @@ class StateRenderer:
         return CameraRenderer(model, self.size, self.size, fast=self.fast)
 
     def joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:
-        """Positions of all joints, ``[steps, nq]``, in states of this simulator."""
+        """Return the positions of all joints, ``[steps, nq]``, in states of this simulator."""
         model = self.renderer.model
         expected = (steps, 1 + model.nq + model.nv)
         if states.shape != expected:
             name = self.index.env_args["env_name"]
-            raise DatasetError(f"{what} has shape {states.shape}, and the simulator of {name} has {expected}")
+            raise DatasetError(f"{what} has shape {states.shape}, but the simulator of {name} has {expected}")
         usable = np.isfinite(states).all(-1)
-        if not usable.all():  # MuJoCo would show something all the same
+        if not usable.all():  # MuJoCo would render such states without an error
             raise DatasetError(f"{what} has NaN or infinity in row {np.argmin(usable)}: leave the demo out")
         return states[:, 1 : 1 + model.nq]
 
@@ -73,7 +73,7 @@ class StateRenderer:
             }
             off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
             (as_stored, *_), view = off.values(), min(off, key=lambda name: off[name])
-            # Most of a scene may look alike upside down, and have little colour.
+            # Most of a scene may look the same upside down, and have little colour.
             other = as_stored > 1 and off[view] < as_stored / 2
             if other or as_stored > CLEARLY:
                 view = view if other else next(iter(views))
@@ -83,9 +83,9 @@ class StateRenderer:
 
 
 def check_images(demonstrations: Demonstrations, cameras: Sequence[str], fast: bool) -> None:
-    """Compare the first images of some cameras with what the simulator shows there.
+    """Compare the first images of some cameras with the simulator's.
 
-    A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
+    Raises DatasetError if they differ, or were rendered in the other quality; warns if there is no state.
     """
     keys = [f"{camera}_image" for camera in cameras]
     index = demonstrations.index(image_keys=keys, demos=1)
@@ -95,7 +95,7 @@ def check_images(demonstrations: Demonstrations, cameras: Sequence[str], fast: b
         rendering, state = read_origin(index.path, index.demos[0])
     if rendering is not None and bool(rendering["fast"]) != fast:
         how = "in full quality" if fast else "fast"
-        raise DatasetError(f"{index.path}: its images were rendered {how}: take fast_rendering={not fast}")
+        raise DatasetError(f"{index.path}: its images were rendered {how}: use fast_rendering={not fast}")
     if state is None:
         warnings.warn(
             f"{index.path} holds no states: its images could not be compared with the simulator's",
@@ -104,4 +104,4 @@ def check_images(demonstrations: Demonstrations, cameras: Sequence[str], fast: b
         return
     first = demonstrations.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
     images = {camera: first[f"{camera}_image"].permute(1, 2, 0).numpy() for camera in cameras}
-    StateRenderer(index, index.image_size, fast).compare(state, images, "render these anew")
+    StateRenderer(index, index.image_size, fast).compare(state, images, "render these again")

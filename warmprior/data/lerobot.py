@@ -19,27 +19,27 @@ from warmprior.data.replay import DatasetError, DemonstrationReader, Demonstrati
 from warmprior.io.extras import require
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
-DECODED = 2**26  # bytes of frames unpacked at once
-TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
+DECODED = 2**26  # bytes of frames that are unpacked at once
+TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
 
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Name the file in whatever goes wrong while it is read."""
+    """Turn any error during reading into a DatasetError that names the file."""
     try:
         yield
     except MemoryError:
         raise
-    except Exception as error:  # pyarrow's own, OSError, KeyError for its columns...
+    except Exception as error:  # pyarrow's errors, OSError, KeyError for columns, ...
         raise DatasetError(
-            f"{path}: damaged, or not of this dataset ({error}). Copy, download, record or convert it again; "
-            "recordings end with LeRobotDataset.finalize()."
+            f"{path}: damaged, or from another dataset ({error}). Copy, download, record or convert it "
+            "again; recordings end with LeRobotDataset.finalize()."
         ) from error
 
 
 class LeRobotReader(DemonstrationReader):
-    """The values of a dataset."""
+    """A reader of a dataset's values."""
 
     def __init__(self, index: LeRobotIndex) -> None:
         self.index = index
@@ -50,7 +50,7 @@ class LeRobotReader(DemonstrationReader):
         self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
 
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Rewards of a dataset without ``next.reward`` are its ``next.success``, or else zeros."""
+        """Read rows of an array; without ``next.reward``, rewards are ``next.success``, or else zeros."""
         feature, part = self._place(key)
         if feature is None:
             out[...] = 0
@@ -59,9 +59,9 @@ class LeRobotReader(DemonstrationReader):
         store_finite(block, out, self.name(demo, key), first, _REBUILD)
 
     def _rows(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
-        """All rows of an episode, ``[rows, width]``."""
+        """Return all rows of an episode, ``[rows, width]``."""
         file = episode_file(self.index.metadata, episode)
-        if file != self._file:  # one at a time
+        if file != self._file:  # columns of one file are kept at a time
             self._file, self._read = file, {}
         start, number = episode["dataset_from_index"], episode["episode_index"]
         with _reading(self.index.path / file):
@@ -74,13 +74,13 @@ class LeRobotReader(DemonstrationReader):
             return self._column(feature)[rows]
 
     def _column(self, name: str) -> np.ndarray:
-        """A column of the file, ``[rows, width]``, read once."""
+        """Return a column of the file, ``[rows, width]``, which is read once."""
         if name not in self._read:
             arrow, parquet = (require(module, "lerobot") for module in ("pyarrow", "pyarrow.parquet"))
             column = parquet.read_table(self.index.path / self._file, columns=[name]).column(name)
             rows, width = len(column), self.index.metadata.features[name]["shape"][0]
             column = column.combine_chunks()
-            if arrow.types.is_nested(column.type):  # the cast refuses rows of another length
+            if arrow.types.is_nested(column.type):  # the cast fails if a row has another length
                 column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
             self._read[name] = column.to_numpy(zero_copy_only=False).reshape(rows, width)
         return self._read[name]
@@ -93,7 +93,7 @@ class LeRobotReader(DemonstrationReader):
         return self.index.columns[key.removeprefix("obs/")]
 
     def name(self, demo: str, key: str) -> str:
-        """What errors call an array of an episode, with the file that holds it."""
+        """Return the name of an episode's array for errors, with the file that holds it."""
         file = episode_file(self.index.metadata, self._episodes[demo])
         feature, observation = self._place(key)[0], key.removeprefix("obs/")
         inside = f" ({observation})" if key != observation != feature else ""
@@ -126,7 +126,7 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
     column = parquet.read_table(path, columns=[feature], filters=rows).column(feature)
 
     def frames(first: int, stop: int) -> Tensor:
-        # Their bytes alone: a path in them could lead anywhere.
+        # Only their bytes are used: a path in them could lead to any file.
         files = [io.BytesIO(value["bytes"]) for value in column[first:stop].to_pylist()]
         pictures = [np.array(image.open(file).convert("RGB")) for file in files]
         return torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
@@ -135,36 +135,36 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
 
 
 class LeRobotDemonstrations(DemonstrationReplay):
-    """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
+    """The demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
     It has the entries and properties of :class:`RobomimicDemonstrations`. Windows of
     :class:`~warmprior.ActionWindow` equal those of ``delta_timestamps``, except before an episode's start:
     LeRobot repeats the first action, which is part of the target; here the history is masked and zero.
 
-    Only images that ``image_keys`` names are fetched and decoded, once and by LeRobot's own decoder, and only
-    those of the selected episodes. Without ``next.reward`` the rewards are ``next.success``, or zeros.
+    Only the images in ``image_keys`` of the selected episodes are fetched and decoded, once and by LeRobot's
+    own decoder. Without ``next.reward`` the rewards are ``next.success``, or zeros.
 
     Args:
-        dataset: the dataset's folder, or its repository in the hub (``"user/name"``).
+        dataset: the dataset's folder, or its repository on the hub (``"user/name"``).
         revision: branch, tag or commit of a repository.
-        env_args: describes the environment in which it was recorded
+        env_args: description of the environment in which the dataset was recorded
             (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
-            did not write; a converted one has to name the same environment. Frequency, widths and names are
-            checked against it, and it tells where robomimic's observations are. Without it, whole features
+            did not write; a converted one must name the same environment. Frequency, widths and names are
+            checked against it, and robomimic's observations are found with it. Without it, whole features
             are observations.
         observation_keys: observations to concatenate; by default those of the task, or for an unknown
             environment ``"observation.environment_state"`` and ``"observation.state"``, if present.
         image_keys: images to read as well: ``"agentview_image"`` is the feature
-            ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
-            are many.
-        episodes: numbers of the episodes to read; all by default. No file of others is needed.
+            ``observation.images.agentview``, as pictures or a video. Use ``storage="memmap"`` for many
+            images.
+        episodes: numbers of the episodes to read; all by default. Files of other episodes are not needed.
         filter_key: a mask of the converted file; for this, ``demos``, ``absolute_actions`` and ``**kwargs``
             see :class:`RobomimicDemonstrations`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        DatasetError: if the dataset is not as it should be, or does not fit the environment; says which
-            folder or file, and why.
+        DatasetError: if the dataset is invalid, or does not fit the environment; the message names the
+            folder or file, and the reason.
         ValueError: see :class:`RobomimicDemonstrations`.
         OSError: if a download fails, or there is no space for memory maps.
 
@@ -218,19 +218,19 @@ def lerobot_steps(
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 
     Args:
-        dataset: its folder, or ``user/name`` of its repository at the hub.
-        observation_keys: features that make the observation, concatenated in this order.
-        demos: how many demonstrations to read, from the first on; all of them by default.
-        episodes: numbers of the episodes to read; all of them by default.
+        dataset: the dataset's folder, or its repository on the hub (``"user/name"``).
+        observation_keys: features of the observation, concatenated in this order.
+        demos: number of demonstrations to read, from the first on; all by default.
+        episodes: numbers of the episodes to read; all by default.
 
     Returns:
-        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``, as
-        :meth:`Task.of <warmprior.training.Task.of>` takes them.
+        Steps for :meth:`Task.of <warmprior.training.Task.of>`, with ``"observation"`` ``[N, d_o]`` and
+        ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        DatasetError: if there is no such feature, or it is no vector of numbers; if there are fewer
-            demonstrations; if the dataset is damaged.
+        DatasetError: if a feature does not exist or is not a vector of numbers, there are fewer
+            demonstrations, or the dataset is damaged.
         OSError: if a download fails.
 
     Examples:

@@ -1,4 +1,4 @@
-"""What a LeRobotDataset v3 holds, read from its ``meta/``."""
+"""The index of a LeRobotDataset v3, read from its ``meta/``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
 
 DESCRIPTION = "meta/warmprior.json"
-"""What :func:`warmprior.data.convert_robomimic` writes beside LeRobot's own files, which LeRobot ignores."""
+"""The file that :func:`warmprior.data.convert_robomimic` adds to LeRobot's own, and that LeRobot ignores."""
 
 ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
 REWARD, SUCCESS = "next.reward", "next.success"
@@ -39,9 +39,9 @@ LEROBOT_VERSION = "v3.0"
 def download_lerobot(
     repository: str, files: Sequence[str] = ("meta/*",), *, revision: str | None = None
 ) -> Path:
-    """Fetch files of a LeRobotDataset by their patterns, unless they are here; return the dataset's folder.
+    """Fetch the files of a LeRobotDataset that match patterns, if needed; return the dataset's folder.
 
-    ``$HF_LEROBOT_HOME/REPOSITORY`` comes first, as in LeRobot, then its cache, without a connection.
+    As in LeRobot, ``$HF_LEROBOT_HOME/REPOSITORY`` comes first, then its cache, which needs no connection.
     """
     default = Path(require("huggingface_hub.constants", "lerobot").HF_HOME) / "lerobot"
     home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()
@@ -66,14 +66,14 @@ def download_lerobot(
 
 @dataclass(frozen=True)
 class LeRobotIndex(DatasetIndex):
-    """What a LeRobotDataset holds, without its values.
+    """The index of a LeRobotDataset, without its values.
 
     Attributes:
-        metadata: LeRobot's own, a ``LeRobotDatasetMetadata``.
+        metadata: LeRobot's own ``LeRobotDatasetMetadata``.
         episodes: the rows of ``meta/episodes`` of the selected episodes.
-        columns: of each observation the feature that holds it, and where in it.
-        images: the feature of each of the images to read.
-        described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
+        columns: for each observation, the feature that holds it and its columns there.
+        images: the feature of each image to read.
+        described: the content of ``meta/warmprior.json``; empty for datasets that were not converted.
     """
 
     metadata: Any
@@ -84,14 +84,14 @@ class LeRobotIndex(DatasetIndex):
 
     @property
     def files(self) -> list[str]:
-        """The files outside ``meta/`` that hold what is selected, below the folder."""
+        """The files outside ``meta/`` that hold the selection, relative to the folder."""
         videos = [name for name in self.images.values() if name in self.metadata.video_keys]
         return sorted(
             {episode_file(self.metadata, e, name) for e in self.episodes for name in [None, *videos]}
         )
 
     def digest(self) -> str:
-        """SHA-256 of what can be read: all files of numbers, and those of the images that are selected."""
+        """Return the SHA-256 of all files of numbers, and of those with selected images."""
         meta = ("meta/info.json", DESCRIPTION, "meta/episodes/*/*.parquet")
         files = {path for pattern in meta for path in self.path.glob(pattern)}
         files |= {self.path / file for file in self.files}
@@ -99,7 +99,7 @@ class LeRobotIndex(DatasetIndex):
 
 
 def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = None) -> str:
-    """The file, below the dataset's folder, that holds an episode's numbers, or its video of a feature."""
+    """Return the file, relative to the dataset's folder, with an episode's numbers or its video."""
     part = "data" if video is None else f"videos/{video}"
     numbers = {f"{n}_index": episode[f"{part}/{n}_index"] for n in ("chunk", "file")}
     template = metadata.data_path if video is None else metadata.video_path
@@ -110,12 +110,12 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
 
 
 def is_remote(dataset: str | Path) -> bool:
-    """Whether a name is a repository of the hub, ``user/name``, and no folder here."""
+    """Return True if a name is a repository on the hub, ``user/name``, and not a local folder."""
     return is_repository(str(dataset)) and not Path(dataset).exists()
 
 
 def _metadata(root: Path) -> Any:
-    """Let LeRobot read what describes a dataset in a folder, checked; the hub is never asked."""
+    """Check the metadata in a folder, and let LeRobot read it without a request to the hub."""
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
@@ -126,24 +126,24 @@ def _metadata(root: Path) -> Any:
         raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     if version != LEROBOT_VERSION:
         raise DatasetError(
-            f"{root} is a LeRobotDataset {version}, and {LEROBOT_VERSION} is needed: convert one of v2.1 by "
+            f"{root} is a LeRobotDataset {version}, but {LEROBOT_VERSION} is needed: convert v2.1 with "
             "python -m lerobot.scripts.convert_dataset_v21_to_v30"
         )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
-        if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
+        if not any(root.glob(pattern)):  # LeRobot would look for it on the hub
             raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
     try:
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
         whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
         _check_columns(metadata, whole)
-    except Exception as error:  # of json, pyarrow, datasets and LeRobot itself
+    except Exception as error:  # json, pyarrow, datasets and LeRobot raise different errors
         raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
     count, frames = metadata.total_episodes, metadata.total_frames
     if not count or numbers != list(range(count)) or steps != frames:
         raise DatasetError(
-            f"{root}: meta/info.json counts {count} episodes of {frames} steps, and meta/episodes "
-            f"{len(numbers)} of {steps}. {again}"
+            f"{root}: meta/info.json counts {count} episodes with {frames} steps, but meta/episodes "
+            f"{len(numbers)} with {steps}. {again}"
         )
     return metadata
 
@@ -155,7 +155,7 @@ _PLACES = {
 
 
 def _is_template(path: str, fields: Sequence[str]) -> bool:
-    """Whether a text is a path with places for names and numbers: a format may be of any length."""
+    """Return True if a text is a path with only these fields: a format could expand to any length."""
     try:
         places = [part[1:] for part in Formatter().parse(path) if part[1] is not None]
     except ValueError:
@@ -165,7 +165,7 @@ def _is_template(path: str, fields: Sequence[str]) -> bool:
 
 
 def _check_info(info: Any) -> str:
-    """Check what is used of ``meta/info.json``, and return its version; a ``ValueError`` names the entry."""
+    """Check the entries of ``meta/info.json`` that are used, and return its version; may raise ValueError."""
 
     def need(name: str, value: Any, good: bool) -> None:
         if not good:
@@ -192,7 +192,7 @@ def _check_info(info: Any) -> str:
 
 
 def _check_columns(metadata: Any, names: Sequence[str]) -> None:
-    """A ``ValueError`` unless ``meta/episodes`` has columns of whole numbers of at least 0."""
+    """Raise ValueError unless ``meta/episodes`` has columns of whole numbers of at least 0."""
     for name in names:
         values = metadata.episodes[name] if name in metadata.episodes.column_names else [None]
         if not all(type(value) is int and value >= 0 for value in values):
@@ -200,7 +200,7 @@ def _check_columns(metadata: Any, names: Sequence[str]) -> None:
 
 
 def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
-    """Check numbers of episodes, and return them in order, each once."""
+    """Check episode numbers, and return them sorted and without repetition."""
     if any(type(number) is not int or not 0 <= number < count for number in numbers):
         raise DatasetError(
             f"{root}: {what} must be some of the episodes 0 to {count - 1}, got {list(numbers)}"
@@ -209,22 +209,22 @@ def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
 
 
 def image_key(feature: str) -> str:
-    """Return the name of a camera's images here: ``observation.images.front`` is ``front_image``."""
+    """Return the name of a camera's images here, such as ``front_image`` for ``observation.images.front``."""
     return f"{feature.rpartition('.')[2]}_image"
 
 
 def action_names(arms: int) -> list[str]:
-    """Return what a dataset calls the pose deltas of so many arms of robosuite, such as ``robot0_rx``."""
+    """Return a dataset's names for the pose deltas of robosuite arms, such as ``robot0_rx``."""
     return [f"robot{arm}_{name}" for arm in range(arms) for name in _ARM_ACTIONS]
 
 
 def state_names(widths: Mapping[str, int]) -> list[str]:
-    """Return what a dataset calls the numbers of observations of these widths, in the same order."""
+    """Return a dataset's names for the numbers of observations of these widths, in the same order."""
     return [f"{key}_{i}" for key, width in widths.items() for i in range(width)]
 
 
 def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """Which feature of a converted dataset holds each observation of robomimic, and their widths."""
+    """Return the features of a converted dataset, each with its robomimic observations and their widths."""
     robots = {key: width for key, width in widths.items() if key.startswith("robot")}
     others = {key: width for key, width in widths.items() if key not in robots}
     layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
@@ -244,10 +244,10 @@ def read_lerobot_index(
     episodes: Sequence[int] | None = None,
     env_args: Mapping[str, Any] | None = None,
 ) -> LeRobotIndex:
-    """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
+    """Return the index of a LeRobotDataset v3 from its ``meta/``, without reading values.
 
-    Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read. Options and
-    errors are those of :class:`~warmprior.data.LeRobotDemonstrations`; ``poses`` also requires the hand
+    From a dataset on the hub only ``meta/`` is fetched, or with ``fetch`` also the files to be read. Options
+    and errors are those of :class:`~warmprior.data.LeRobotDemonstrations`; ``poses`` also requires the hand
     pose of every arm, from which absolute actions are built.
     """
     remote = is_remote(dataset)
@@ -282,12 +282,12 @@ def read_lerobot_index(
             raise DatasetError(f"{root}: {key!r} is an image, not a vector: name it in image_keys")
         if key not in columns and (feature := metadata.features.get(key)):
             raise DatasetError(
-                f"{root}: {key!r} has dtype {feature['dtype']} and shape {list(feature['shape'])}, and "
-                "observations are vectors of numbers: leave it out, or write one that is"
+                f"{root}: {key!r} has dtype {feature['dtype']} and shape {list(feature['shape'])}, but "
+                "observations must be vectors of numbers: leave it out, or write it as a vector"
             )
         if key not in columns:
-            seen = [name for name in columns if name in named or name.startswith("observation")]
-            raise unknown(root, "observation", key, seen)
+            options = [name for name in columns if name in named or name.startswith("observation")]
+            raise unknown(root, "observation", key, options)
     cameras = {image_key(name): name for name in metadata.camera_keys if name not in metadata.depth_keys}
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     count = len(rows)
@@ -347,7 +347,7 @@ def _description(root: Path) -> dict[str, Any]:
     except ValueError as error:
         raise DatasetError(f"{error}. Convert the file again.") from error
     if not (isinstance(description, dict) and description.get("format") == 1):
-        raise DatasetError(f"{path} is not of this version: convert the file again, or remove it")
+        raise DatasetError(f"{path} is from another version: convert the file again, or remove it")
     observations, masks = description.get("observations"), description.get("masks", {})
     for name, value, good in (
         ("observations", observations, _is_place),
@@ -360,7 +360,7 @@ def _description(root: Path) -> dict[str, Any]:
 
 
 def _is_place(value: Any) -> bool:
-    """Whether a value says where in a feature an observation is."""
+    """Return True if a value names a feature and the columns of an observation there."""
     return isinstance(value, list) and [type(part) for part in value] == [str, int, int]
 
 
@@ -369,10 +369,10 @@ def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], wh
     if isinstance(names, dict):  # {"motors": [...]} or {"x": 0, "y": 1, ...}
         lists = [value for value in names.values() if isinstance(value, list)]
         names = [name for value in lists for name in value] if lists else list(names)
-    # Seven numbers may be joints as well as a pose.
+    # Names are compared because seven numbers may be joints or a pose.
     if names and names != expected:
         raise DatasetError(
-            f"{root}: {what} {', '.join(expected)}, and here {', '.join(map(str, names))}: choose another "
+            f"{root}: {what} {', '.join(expected)}, but here {', '.join(map(str, names))}: choose another "
             "task, or set names in meta/info.json to null if they mean the same"
         )
 
@@ -417,11 +417,11 @@ def _named_columns(
     ]
     sums = [{name: sum(parts.values()) for name, parts in layout.items()} for layout in layouts]
     fits = [total.items() <= vectors.items() for total in sums]
-    # Robots alone may be as wide as the whole state of another task.
+    # A robot's state may be as wide as the whole state of another task.
     fits[2] = fits[2] and ENVIRONMENT_STATE not in vectors
     if not any(fits):
         raise DatasetError(
-            f"{root}: the observations are {vectors}, and those of {task.env_name} "
+            f"{root}: the observations are {vectors}, but those of {task.env_name} "
             f"{' or '.join(map(str, reversed(sums)))}: choose another task or dataset"
         )
     layout = layouts[fits.index(True)]
@@ -438,7 +438,7 @@ def _named_columns(
 def _image_size(
     root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], keys: Sequence[str]
 ) -> int:
-    """The side of the images to read, in pixels; 0 if there are none."""
+    """Return the side of the images to read, in pixels, or 0 if there are none."""
     sizes = {}
     for key in keys:
         if key not in cameras:

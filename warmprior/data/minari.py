@@ -1,4 +1,4 @@
-"""Minari's demonstrations: a dataset of the Farama Foundation's format, read by its own package."""
+"""Minari's demonstrations: datasets in the Farama Foundation's format, read by its own package."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from warmprior.data.replay import (
 from warmprior.io.extras import require
 
 SUCCESS_NAMES = ("success", "is_success")
-"""What environments of Gymnasium call success in their ``info``."""
+"""The names of success in the ``info`` of Gymnasium's environments."""
 
 
 def load_minari(name: str) -> Any:
-    """The dataset of a name such as ``"D4RL/door/human-v2"``, downloaded if it is not there.
+    """Return the dataset with a name such as ``"D4RL/door/human-v2"``, after downloading it if needed.
 
     Raises:
-        FileNotFoundError: if it is neither on this machine nor to be had.
-        DatasetError: if it is damaged.
+        FileNotFoundError: if the dataset is not on this machine and cannot be downloaded.
+        DatasetError: if the dataset is damaged.
     """
     minari = require("minari", "minari")
     try:
@@ -46,11 +46,11 @@ def load_minari(name: str) -> Any:
         folder = Path(here(name))
         if (folder / "data").exists():
             raise DatasetError(
-                f"{folder}: not a readable dataset of Minari ({error}): download it again"
+                f"{folder}: not a readable Minari dataset ({error}): download it again"
             ) from error
         raise FileNotFoundError(
             f"minari:{name}: no such dataset at {folder} ({error}): `minari list remote` shows public "
-            "ones, and MINARI_DATASETS_PATH says where local ones are"
+            "datasets, and MINARI_DATASETS_PATH is the folder of local ones"
         ) from error
 
 
@@ -63,15 +63,15 @@ def read_minari_index(
     filter_key: str | None = None,
     poses: bool = False,
 ) -> DatasetIndex:
-    """What a dataset holds; see :class:`MinariDemonstrations` for the arguments."""
+    """Return the index of a dataset; see :class:`MinariDemonstrations` for the arguments."""
     dataset = load_minari(name)
     where = Path(dataset.spec.data_path)
     if filter_key is not None or poses:
         what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
-        raise DatasetError(f"{where}: a dataset of Minari has no {what}: leave the option out")
+        raise DatasetError(f"{where}: a Minari dataset has no {what}: leave the option out")
     action = dataset.action_space
     if getattr(action, "dtype", None) is None or action.dtype.kind != "f" or len(action.shape) != 1:
-        raise DatasetError(f"{where}: actions are {action}, and a flow needs one vector of real numbers")
+        raise DatasetError(f"{where}: actions are {action}, but a flow needs one vector of real numbers")
     spaces = dict(_spaces(dataset.observation_space))
     vectors = {key: math.prod(space.shape) for key, space in spaces.items() if _is_vector(space)}
     pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
@@ -85,7 +85,7 @@ def read_minari_index(
     check_count(where, demos, dataset.total_episodes)
     episodes = [int(i) for i in dataset.episode_indices][:demos]
     with _reading(where, "its episodes"):
-        steps = [int(found["total_steps"]) for found in dataset.storage.get_episode_metadata(episodes)]
+        steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
     if not steps or min(steps) < 1:
         raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
     return DatasetIndex(
@@ -105,15 +105,15 @@ def read_minari_index(
 
 @contextmanager
 def _reading(path: Path, what: str) -> Iterator[None]:
-    """Name the dataset in whatever goes wrong while it is read."""
+    """Turn any error during reading into a DatasetError that names the dataset."""
     try:
         yield
-    except Exception as error:  # h5py's own, OSError, KeyError for its groups...
+    except Exception as error:  # h5py's errors, OSError, KeyError for groups, ...
         raise DatasetError(f"{path}: {what} cannot be read ({error}): download it again") from error
 
 
 def _spaces(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of a space by name; those of a dictionary in another are ``"outer/inner"``."""
+    """Yield the leaves of a space by name; those of nested dictionaries are ``"outer/inner"``."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         for key, part in inner.items():
@@ -132,11 +132,11 @@ def _is_picture(space: Any) -> bool:
 
 
 class MinariReader(DemonstrationReader):
-    """The values of a dataset."""
+    """A reader of a dataset's values."""
 
     def __init__(self, name: str, path: Path) -> None:
         self._dataset, self._path = load_minari(name), path
-        self._episode = lru_cache(maxsize=1)(self._read)  # its observations, actions and rewards one by one
+        self._episode = lru_cache(maxsize=1)(self._read)  # arrays of one episode are read one after another
 
     def _read(self, demo: str) -> Any:
         with _reading(self._path, f"episode {demo}"):
@@ -146,14 +146,14 @@ class MinariReader(DemonstrationReader):
         episode = self._episode(demo)
         if not key.startswith("obs/"):
             return np.asarray(getattr(episode, key))
-        found = episode.observations
-        if isinstance(found, Mapping):
+        observations = episode.observations
+        if isinstance(observations, Mapping):
             for part in key.removeprefix("obs/").split("/"):
-                found = found[part]
-        return np.asarray(found)[:-1]  # the last one follows the last action
+                observations = observations[part]
+        return np.asarray(observations)[:-1]  # the last one follows the last action
 
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """See the base class."""
+        """Do as the base class describes."""
         values = self._values(demo, key)
         block = values.reshape(len(values), -1)[first : first + len(out)]
         if block.shape != out.shape:
@@ -163,35 +163,35 @@ class MinariReader(DemonstrationReader):
         store_finite(block, out, self.name(demo, key), first, "Delete the episode, or download it again.")
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """See the base class."""
+        """Do as the base class describes."""
         frames = torch.from_numpy(self._values(demo, f"obs/{key}")[: len(out)])
         out.copy_(frames.permute(0, 3, 1, 2))
 
     def name(self, demo: str, key: str) -> str:
-        """See the base class."""
+        """Do as the base class describes."""
         return f"{self._path}: {key.removeprefix('obs/')} of episode {demo}"
 
 
 class MinariDemonstrations(DemonstrationReplay):
-    """Demonstrations of a Minari dataset, as one immutable TorchRL replay buffer.
+    """The demonstrations of a Minari dataset, as one immutable TorchRL replay buffer.
 
     It has the entries and properties of :class:`RobomimicDemonstrations`. An observation that follows the
     last action of an episode is left out.
 
     Args:
-        name: of the dataset, such as ``"D4RL/door/human-v2"``. One that is not in Minari's folder
+        name: name of the dataset, such as ``"D4RL/door/human-v2"``. A dataset that is not in Minari's folder
             (``MINARI_DATASETS_PATH``) is downloaded.
-        observation_keys: observations to concatenate: names of a dictionary of them, ``"outer/inner"`` for
-            one in another; all vectors by default.
-        image_keys: images to read as well, square ones.
-        demos: how many to take, from the first on; all by default.
-        filter_key: there are no masks: ``None``.
-        absolute_actions: there are no poses: ``False``.
+        observation_keys: observations to concatenate: names in a dictionary space, ``"outer/inner"`` in
+            nested ones; all vectors by default.
+        image_keys: images to read as well; they must be square.
+        demos: number of demonstrations to take, from the first on; all by default.
+        filter_key: must be ``None``, because there are no masks.
+        absolute_actions: must be ``False``, because there are no poses.
         **kwargs: see :class:`RobomimicDemonstrations`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        DatasetError: if it is damaged, or its actions are no vector of real numbers.
+        DatasetError: if the dataset is damaged, or its actions are not vectors of real numbers.
 
     Examples:
         >>> from warmprior.data import MinariDemonstrations
@@ -223,9 +223,9 @@ class MinariDemonstrations(DemonstrationReplay):
 
 
 def minari_environment(name: str) -> dict[str, Any] | None:
-    """What a dataset says of its environment, for :func:`warmprior.envs.registered_env`.
+    """Return a dataset's description of its environment, for :func:`warmprior.envs.registered_env`.
 
-    ``None`` if it has none. ``"success"`` is what its steps call success, if they do.
+    The result is ``None`` without a description. Its ``"success"`` is the steps' name of success, if any.
     """
     dataset = load_minari(name)
     spec = dataset.env_spec

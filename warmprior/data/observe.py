@@ -1,4 +1,4 @@
-"""Raw recordings of robosuite, which hold states and actions, as files with observations."""
+"""Conversion of raw robosuite recordings, which hold states and actions, to files with observations."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ def observe_recordings(
     observation_keys: Sequence[str] | None = None,
     demos: int | None = None,
 ) -> Path:
-    """Replay the states of recordings, and write what the simulator shows in them beside the actions.
+    """Replay the states of recordings, and write the simulator's observations together with the actions.
 
     The result has robomimic's low-dimensional layout: ``obs`` before each action, ``rewards`` (1 where the
-    next state is solved), ``dones``, the states, and ``env_args``. The recordings are those of robosuite's
-    ``collect_human_demonstrations``, from robosuite 1.0 on, of any robot and controller of robosuite 1.5; or
-    any robomimic file with states.
+    next state is solved), ``dones``, the states, and ``env_args``. Recordings come from robosuite's
+    ``collect_human_demonstrations``, from robosuite 1.0 on, with any robot and controller of robosuite 1.5;
+    any robomimic file with states works too.
 
     Args:
         path: an HDF5 file such as ``demo.hdf5``, with ``states`` and ``actions`` per demo.
-        out: where to write; must not exist.
+        out: the file to write; it must not exist.
 
     Keyword Args:
-        observation_keys: of robosuite's observations; by default the object and every arm's pose, gripper
-            and joints.
-        demos: how many, from the first on; all by default.
+        observation_keys: robosuite's observations to write; by default the object and every arm's pose,
+            gripper and joints.
+        demos: number of demos, from the first on; all by default.
 
     Returns:
-        ``out``.
+        The path ``out``.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileExistsError: if there is something at ``out``.
-        DatasetError: if states or actions are not those of the environment that the file names.
+        FileExistsError: if ``out`` exists.
+        DatasetError: if states or actions do not fit the environment that the file names.
 
     Examples:
         >>> from warmprior.data import observe_recordings
@@ -92,13 +92,13 @@ def observe_recordings(
 
 
 def recorded_env_args(file: Any, path: Path) -> dict[str, Any]:
-    """The environment of recordings, in robomimic's terms: ``env_args``, or robosuite's own ``env_info``."""
+    """Return the environment of recordings as ``env_args``, if needed from robosuite's ``env_info``."""
     described = read_described(file, "env_args")
     if described is not None:
         return check_env_args(f"{path}: data.attrs['env_args']", described)
     info, attributes = read_described(file, "env_info"), file["data"].attrs
     if not isinstance(info, dict):
-        raise DatasetError(f"{path}: data has neither 'env_args' nor 'env_info', which name the environment")
+        raise DatasetError(f"{path}: data has neither 'env_args' nor 'env_info' to name the environment")
     name = str(info.pop("env_name", attributes.get("env", "")))
     version = str(attributes.get("repository_version", "unknown"))
     return check_env_args(
@@ -108,10 +108,10 @@ def recorded_env_args(file: Any, path: Path) -> dict[str, Any]:
 
 
 def described_simulator(env_args: Mapping[str, Any], path: Path) -> Any:
-    """The simulator that a file describes; a ``DatasetError`` if robosuite cannot build it."""
+    """Build the simulator that a file describes; raise DatasetError if robosuite cannot build it."""
     try:
         return make_simulator(modernize_env_args(env_args))
-    except Exception as error:  # whatever an unexpected description leads to
+    except Exception as error:  # an unexpected description can raise anything
         raise DatasetError(
             f"{path}: robosuite cannot build {env_args['env_name']!r} as it is described ({error!r}): "
             "correct data.attrs['env_info'], or env_args"
@@ -128,11 +128,11 @@ def _write_demo(source: Any, name: str, demo: Any, loop: StepLoop) -> int:
             arrays[key] = np.asarray(stored[()], np.float64)
     states, actions = arrays["states"], arrays["actions"]
     widths, env = (len(loop.state()), loop.env.action_dim), type(loop.env).__name__
-    found = tuple(value.shape[-1] if value.ndim == 2 else value.shape for value in arrays.values())
-    if found != widths or len(states) != len(actions) or not len(states):
+    stored = tuple(value.shape[-1] if value.ndim == 2 else value.shape for value in arrays.values())
+    if stored != widths or len(states) != len(actions) or not len(states):
         raise DatasetError(
-            f"{source.filename}: data/{name} has states {states.shape} and actions {actions.shape}, and "
-            f"{env} with this robot has [N, {widths[0]}] and [N, {widths[1]}]: they are of another robot"
+            f"{source.filename}: data/{name} has states {states.shape} and actions {actions.shape}, but "
+            f"{env} with this robot has [N, {widths[0]}] and [N, {widths[1]}]: they are from another robot"
         )
     for key, value in arrays.items():
         if not np.isfinite(value).all():

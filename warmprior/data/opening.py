@@ -1,4 +1,4 @@
-"""Where demonstrations are: an HDF5 file of robomimic, or a dataset of LeRobot or Minari."""
+"""Places of demonstrations: robomimic HDF5 files, and LeRobot and Minari datasets."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.files import digest_of, file_digest
 
 LEROBOT, MINARI = "lerobot:", "minari:"
-"""What stands before the folder or repository of a LeRobotDataset, and the name of a Minari dataset."""
+"""The prefixes of a LeRobotDataset's folder or repository, and of a Minari dataset's name."""
 
 
 def dataset_name(place: str | Path, prefix: str) -> str | None:
-    """What stands behind a prefix, :data:`LEROBOT` or :data:`MINARI`, if the place begins with it."""
+    """Return the part of a place after a prefix, :data:`LEROBOT` or :data:`MINARI`, if it begins with it."""
     text = str(place)
     return text.removeprefix(prefix) if text.startswith(prefix) else None
 
 
 def name_of_place(place: str | Path) -> str:
-    """A short name: that of the file without its ending, of the folder, of the repository or dataset."""
+    """Return the short name of a file, without its ending, or of a folder, repository or dataset."""
     if (name := dataset_name(place, MINARI)) is not None:
         return name.replace("/", "-")
     folder = dataset_name(place, LEROBOT)
@@ -33,13 +33,13 @@ def name_of_place(place: str | Path) -> str:
 
 
 class Demonstrations:
-    """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
+    """The demonstrations at one place; their values are only read by :meth:`replay`.
 
     A place is an HDF5 file, ``lerobot:`` and the folder or repository of a LeRobotDataset, or ``minari:`` and
     the name of a Minari dataset.
 
     ``env_args`` are for a LeRobotDataset that does not describe its own environment; a ``mask``, such as
-    ``"train"``, selects some of them. ``name`` is what results call the place.
+    ``"train"``, selects some demonstrations. ``name`` is the name of the place in results.
 
     Examples:
         >>> from warmprior.data.opening import Demonstrations
@@ -65,23 +65,23 @@ class Demonstrations:
         self.name = name if mask is None else f"{name} (mask {mask})"
 
     def image_keys(self, names: Sequence[str]) -> list[str]:
-        """Names of images as policies have them; LeRobot's own, ``observation.images.front``, are known."""
+        """Return policies' names of images; LeRobot's own, ``observation.images.front``, are converted."""
         return [image_key(name) if name.startswith("observation.") else name for name in names]
 
     def index(self, **options: Any) -> DatasetIndex:
-        """What is there; options (``image_keys``, ``demos`` and so on) as of ``read_index``."""
+        """Return the index, with options of ``read_index`` (``image_keys``, ``demos`` and so on)."""
         return self._index(self._place, **self._options, **options)
 
     def replay(self, **options: Any) -> DemonstrationReplay:
-        """Read them; options as of :class:`RobomimicDemonstrations`."""
+        """Read the demonstrations, with options of :class:`RobomimicDemonstrations`."""
         return self._replay(self._place, **self._options, **options)
 
     def environment(self) -> dict[str, Any] | None:
-        """Of Gymnasium, as :func:`warmprior.envs.registered_env` takes it, if they were recorded in one."""
+        """Return the recorded Gymnasium environment, for :func:`warmprior.envs.registered_env`, if any."""
         return minari_environment(self._place) if self._prefix == MINARI else None
 
     def digest(self, **used: Any) -> str:
-        """SHA-256 of the contents; of a LeRobotDataset those that the options of :meth:`index` select."""
+        """Return the SHA-256 of the contents; in a LeRobotDataset, of those that the options select."""
         if self._prefix == LEROBOT:
             whole = read_lerobot_index(self._place, fetch=True, **self._options, **used).digest()
         elif self._prefix == MINARI:

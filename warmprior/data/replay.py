@@ -1,4 +1,4 @@
-"""What a set of demonstrations holds, whatever format it is stored in, and the replay buffer made of it."""
+"""The index of demonstrations in any format, and the replay buffer with their values."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
-BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
-LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
+BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
+LARGEST = 1e9  # in any unit; a larger value is damage, and would squash all others of its feature
 
 
 class DatasetError(ValueError):
-    """A demonstration file is not what it should be; the message says where and what to do.
+    """An invalid demonstration file; the message says where it is wrong and what to do.
 
     Examples:
         >>> from pathlib import Path
@@ -49,15 +49,15 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True)
 class DatasetIndex:
-    """What demonstrations hold, without their values.
+    """The index of demonstrations, without their values.
 
     Attributes:
         path: the file or folder.
         demos: names of the selected demos, in the order of their numbers.
         observation_keys: the observations to read, in the order of concatenation.
         image_size: side of the images to read in pixels; 0 if there are none.
-        available_keys: every observation there is.
-        env_args: the environment as it is described there; empty if it is unknown.
+        available_keys: all observations.
+        env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
     """
 
@@ -82,13 +82,13 @@ class DatasetIndex:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Cameras that have images."""
+        """The cameras that have images."""
         ending = "_image"
         return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
 
 
 class DemonstrationReader(ABC):
-    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
+    """A reader of demonstrations' values, given their :class:`DatasetIndex`."""
 
     @abstractmethod
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
@@ -103,11 +103,11 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
-        """What errors call an array of a demo, with the file that holds it."""
+        """Return the name of a demo's array for errors, with the file that holds it."""
 
 
 def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
-    """Refuse what describes no environment as robomimic does: text ``env_name`` and a dict ``env_kwargs``."""
+    """Raise DatasetError unless there are robomimic's text ``env_name`` and dict ``env_kwargs``."""
     for key, kind in (("env_name", str), ("env_kwargs", dict)):
         if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
             raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
@@ -115,15 +115,15 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
 
 
 def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] | None:
-    """See :func:`~warmprior.envs.env_args.declared_actions`; a ``DatasetError`` if a file's are no such."""
+    """Call :func:`~warmprior.envs.env_args.declared_actions`; raise DatasetError if it fails."""
     try:
         return declared_actions(env_args)
-    except Exception as error:  # whatever their unexpected structure leads to
-        raise DatasetError(f"{path}: env_args do not suit these actions: {error!r}") from error
+    except Exception as error:  # an unexpected structure can raise anything
+        raise DatasetError(f"{path}: env_args do not fit these actions: {error!r}") from error
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:
-    """Refuse to take no demonstrations, or more than there are."""
+    """Raise an error for no demonstrations, or for more than there are."""
     if demos is not None:
         check_whole_numbers(demos=demos)
         if demos > available:
@@ -136,39 +136,39 @@ def unknown(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetEr
 
 
 def common_size(path: Path, sides: Mapping[int, str]) -> int:
-    """Return the side of all images in pixels, 0 if there are none, from one that has each side."""
+    """Return the common side of all images in pixels, 0 without images; raise DatasetError if they differ."""
     if len(sides) > 1:
         raise DatasetError(f"{path}: images must have one size, got {sides}: render them again")
     return next(iter(sides), 0)
 
 
 def pose_keys(action_dim: int) -> list[str]:
-    """Return the observations of the hands' poses, of as many arms as the pose deltas are for."""
+    """Return the observations of the hands' poses, for as many arms as the pose deltas have."""
     arms = range(min(action_dim // 7, 2))
     return [f"robot{arm}_eef_{part}" for arm in arms for part in ("pos", "quat")]
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
-    """Copy numbers to ``out``; a ``DatasetError`` if one is not finite there, or above 1e9."""
+    """Copy numbers to ``out``; raise DatasetError if one is not finite there, or above 1e9."""
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)
-    usable = np.abs(out) <= LARGEST  # NaN is not
+    usable = np.abs(out) <= LARGEST  # False for NaN
     if not usable.all():
         value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
         raise DatasetError(f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g}. {advice}")
 
 
-UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
+UNIT_TOLERANCE = 1e-2  # error of a quaternion's length; recorded ones are off by 1e-6
 
-LOOKED_AT = 20  # demos that decide what actions are
-POSES = 0.25  # between 0.01, of poses a control step ahead of the hand, and 1, of what knows nothing of it
+LOOKED_AT = 20  # number of demos that decide if actions are poses
+POSES = 0.25  # between 0.01, for poses a control step ahead of the hand, and 1, for unrelated numbers
 
 
 def _are_poses(index: DatasetIndex, reader: DemonstrationReader, declared: tuple[str, str] | None) -> bool:
-    """Whether actions are poses in the world that ``env_args`` declare as deltas (``low_dim_abs.hdf5``).
+    """Return True if actions are world poses that ``env_args`` declare as deltas (``low_dim_abs.hdf5``).
 
-    Their positions tell: poses are near the hand, where deltas are not, however long or short. A
-    ``DatasetError`` if ``env_args`` are wrong in another way.
+    The positions decide: poses are near the hand, and deltas are not, whatever their length. Raises
+    DatasetError if ``env_args`` are wrong in another way.
     """
     arms, rest = divmod(index.action_dim, 7)
     hands = [f"robot{arm}_eef_pos" for arm in range(arms)]
@@ -187,7 +187,7 @@ def _are_poses(index: DatasetIndex, reader: DemonstrationReader, declared: tuple
     if kind == "absolute":
         if frame == "world" and in_world > 1:
             raise DatasetError(
-                f"{path}: actions are no poses near robot0_eef_pos, but env_args declare absolute ones: "
+                f"{path}: actions are not poses near robot0_eef_pos, but env_args declare absolute ones: "
                 "correct control_delta (input_type) there"
             )
         return False
@@ -200,7 +200,7 @@ def _are_poses(index: DatasetIndex, reader: DemonstrationReader, declared: tuple
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    """Quotient of the sums of squares; infinite where there is nothing to compare with."""
+    """Return the quotient of the sums of squares, infinite if the second is 0."""
     of = float(np.square(whole).sum())
     return float(np.square(part).sum()) / of if of else np.inf
 
@@ -220,7 +220,7 @@ def _allocate(
         EPISODE: (torch.int64, ()),
         FRAME: (torch.int64, ()),
     }
-    # Expanded scalars cost nothing, and the real memory is taken once.
+    # Expanded scalars take no memory, and the real memory is allocated once.
     data = TensorDict(batch_size=[steps])
     for key, (dtype, width) in widths.items():
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
@@ -228,7 +228,7 @@ def _allocate(
     available = available_memory()
     if storage == "memory" and needed > available:
         raise DatasetError(
-            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB "
+            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB "
             "are free: use storage='memmap' or fewer demos"
         )
     if storage == "memory":
@@ -239,7 +239,7 @@ def _allocate(
             _reserve(value)
     except OSError as error:
         raise OSError(
-            f"{scratch_dir or 'the folder of temporary files'}: cannot take {needed / 1e9:.3g} GB for "
+            f"{scratch_dir or 'the folder of temporary files'}: cannot store {needed / 1e9:.3g} GB for "
             f"{index.path} ({error}): free some space or choose another scratch_dir"
         ) from error
     return data
@@ -250,10 +250,10 @@ def _vector_key(index: DatasetIndex) -> NestedKey:
 
 
 def _reserve(mapped: Any) -> None:
-    """Take the space of a memory map: writing to one without it kills the process (SIGBUS)."""
+    """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
     if not hasattr(os, "posix_fallocate"):
         return
-    handler = getattr(mapped, "_handler", None)  # of a file without a name
+    handler = getattr(mapped, "_handler", None)  # set for a file without a name
     file = os.open(mapped.filename, os.O_RDWR) if handler is None else os.dup(handler.fd)
     try:
         os.posix_fallocate(file, 0, max(1, mapped.numel() * mapped.element_size()))
@@ -289,7 +289,7 @@ def _read_absolute(
             off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
             if off.max() > UNIT_TOLERANCE:
                 what, row = reader.name(demo, quaternion), int(off.argmax())
-                raise DatasetError(f"{what} is no rotation in row {first + row}: its length is not 1")
+                raise DatasetError(f"{what} is not a rotation in row {first + row}: its length is not 1")
         rows[...] = to_absolute(
             torch.from_numpy(deltas),
             torch.from_numpy(positions),
@@ -300,10 +300,10 @@ def _read_absolute(
 
 
 def solved(reward: Tensor, env_args: Mapping[str, Any]) -> Tensor:
-    """Where a reward says that the task is solved, bool: where it is robosuite's ``reward_scale``.
+    """Return a mask, bool, of rewards that mean a solved task: those equal to robosuite's ``reward_scale``.
 
-    Shaped rewards are positive before that. Where the scale is ``None`` they do not say it, and of an unknown
-    environment any that is positive does.
+    Shaped rewards are positive earlier. With the scale ``None``, rewards never mean success; in an unknown
+    environment, every positive reward does.
     """
     if not env_args:
         return reward > 0
@@ -321,7 +321,7 @@ def _fill(
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
-    # Of what takes long: images are unpacked one by one.
+    # A bar only for images, which take long because they are unpacked one by one.
     bar = tqdm(index.demos, f"read {index.path.name}", unit="demo", disable=not index.image_keys)
     for episode, (demo, (start, stop)) in enumerate(zip(bar, pairwise(rows), strict=True)):
         for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
@@ -341,7 +341,7 @@ def _fill(
 
 
 class DemonstrationReplay(TensorDictReplayBuffer):
-    """What buffers of all formats share; entries and options as :class:`RobomimicDemonstrations` tells."""
+    """The base class of buffers of all formats; see :class:`RobomimicDemonstrations` for the options."""
 
     def __init__(
         self,
@@ -366,8 +366,8 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             try:
                 solved(torch.zeros(1), index.env_args)
                 conventions = delta_conventions(index.env_args) if absolute_actions else None
-            except Exception as error:  # whatever their unexpected structure leads to
-                raise DatasetError(f"{index.path}: env_args do not suit these actions: {error!r}") from error
+            except Exception as error:  # an unexpected structure can raise anything
+                raise DatasetError(f"{index.path}: env_args do not fit these actions: {error!r}") from error
 
         if conventions is not None:
             arms = len(conventions[1])
@@ -378,8 +378,8 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         poses = _are_poses(index, reader, declared)
         if poses and conventions is None:
             raise DatasetError(
-                f"{index.path}: actions are absolute poses, but env_args declare deltas: take "
-                "absolute_actions=True (of a Task: actions='absolute'), or correct control_delta (input_type)"
+                f"{index.path}: actions are absolute poses, but env_args declare deltas: use "
+                "absolute_actions=True (in a Task: actions='absolute'), or correct control_delta (input_type)"
             )
 
         def read_actions(demo: str, out: np.ndarray) -> None:
@@ -400,7 +400,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def data(self) -> TensorDictBase:
-        """All steps, ``[N]``; shares memory with the storage."""
+        """All steps, ``[N]``, which share memory with the storage."""
         return self._storage.get(slice(None))
 
     @property
@@ -410,10 +410,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def env_args(self) -> dict[str, Any]:
-        """The environment in which the data were recorded, for robosuite 1.5; a copy.
+        """A copy of the description of the recorded environment, for robosuite 1.5.
 
-        A ``ValueError`` if it is unknown; see :func:`warmprior.envs.modernize_env_args`. Where actions are
-        stored as absolute poses, :class:`~warmprior.AbsoluteActions` turns them into what it takes.
+        Raises ValueError if the environment is unknown; see :func:`warmprior.envs.modernize_env_args`. If
+        actions are stored as absolute poses, :class:`~warmprior.AbsoluteActions` converts them for it.
         """
         if not self._index.env_args:
             raise ValueError(f"{self.path} does not say which environment it was recorded in")
@@ -421,22 +421,22 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def task(self) -> TaskSpec | None:
-        """The task of :data:`warmprior.envs.TASKS` recorded here, or ``None`` if it is another."""
+        """The recorded task of :data:`warmprior.envs.TASKS`, or ``None`` if it is not among them."""
         return self._index.task
 
     @property
     def observation_keys(self) -> tuple[str, ...]:
-        """The keys whose values stand side by side in the observation's vector."""
+        """The keys whose values are concatenated in the observation's vector."""
         return self._index.observation_keys
 
     @property
     def image_size(self) -> int:
-        """Side of the images in pixels, 0 if there are none."""
+        """The side of the images in pixels, 0 if there are none."""
         return self._index.image_size
 
     @property
     def pose_columns(self) -> Tensor:
-        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``."""
+        """The columns of ``"observation"`` with grippers' positions and quaternions, int64 ``[arms, 7]``."""
         first = dict(zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False))
         columns: list[list[int]] = []
         while not columns or f"robot{len(columns)}_eef_pos" in first:
@@ -445,7 +445,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         return torch.tensor(columns)
 
     def joint_columns(self, key: str) -> list[int]:
-        """For each action the column of ``"observation"`` that it is a target of, as ``key`` goes, or -1."""
+        """Return for each action the column of ``"observation"``, within ``key``, that it sets, or -1."""
         check_choice("joint_key", key, self.observation_keys)
         index, position = self._index, self.observation_keys.index(key)
         first, width = sum(index.observation_dims[:position]), index.observation_dims[position]

@@ -1,4 +1,4 @@
-"""robomimic's and MimicGen's demonstrations: a TorchRL replay buffer of any file."""
+"""robomimic's and MimicGen's demonstrations, as a TorchRL replay buffer."""
 
 from __future__ import annotations
 
@@ -11,43 +11,44 @@ from warmprior.data.replay import DemonstrationReplay
 
 
 class RobomimicDemonstrations(DemonstrationReplay):
-    """Demonstrations of an HDF5 file of robomimic or MimicGen, as one immutable TorchRL replay buffer.
+    """The demonstrations of a robomimic or MimicGen HDF5 file, as one immutable TorchRL replay buffer.
 
     The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
     the order of the demos' numbers:
 
-    - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side; with images nested,
-      ``("observation", "state")`` ``[N, d_s]`` and each as uint8 ``[N, 3, size, size]``;
+    - ``"observation"`` ``[N, d_o]`` float32, the concatenated observation keys; with images it is nested:
+      ``("observation", "state")`` ``[N, d_s]``, and each image uint8 ``[N, 3, size, size]``;
     - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
     - ``("next", "reward")`` ``[N, 1]`` float32, zeros if none is recorded;
     - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
-      on the last step of each demo, terminated there if its reward is that of a solved task (robosuite's
+      on the last step of each demo; terminated there if its reward is that of a solved task (robosuite's
       ``reward_scale``, 1 by default), else truncated;
-    - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row itself.
+    - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row number.
 
     Names, shapes and masks are checked before values are read.
 
     Args:
         path: an HDF5 file.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
-        demos: how many to take, the first ones by their numbers; all if ``None``.
+        demos: number of demos to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
-            unknown environment the object, every robot's pose and gripper, and all vectors of no robot.
-        image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; take
-            ``storage="memmap"`` where they are many.
-        absolute_actions: turn the recorded pose deltas into absolute poses
+            unknown environment the object, every robot's pose and gripper, and all other vectors that do not
+            belong to a robot.
+        image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; use
+            ``storage="memmap"`` for many images.
+        absolute_actions: True turns the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm. Recorded poses that
-            the file declares as deltas (``low_dim_abs.hdf5``) are taken as they are.
-        **kwargs: ``as_recorded``: also read such poses without ``absolute_actions``, as they stand in the
-            file; ``storage``: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default
-            temporary ones; ``device`` of the tensors in memory; and ``batch_size``, ``sampler``,
-            ``transform``, ``prefetch``, ``pin_memory`` or ``generator`` of TorchRL's.
+            the file declares as deltas (``low_dim_abs.hdf5``) are not changed.
+        **kwargs: ``as_recorded`` reads such poses without ``absolute_actions`` too, as stored in the file;
+            ``storage`` is ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default temporary
+            ones; ``device`` is that of the tensors in memory; ``batch_size``, ``sampler``, ``transform``,
+            ``prefetch``, ``pin_memory`` and ``generator`` are TorchRL's.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        DatasetError: if the file is not as it should be; says which demo and key.
-        ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
-            of a controller without pose deltas.
+        DatasetError: if the file is invalid; the message names the demo and key.
+        ValueError: if ``storage`` is unknown or does not fit ``device``, or ``absolute_actions`` is True for
+            a controller without pose deltas.
         OSError: if there is no space for memory maps.
 
     Examples:
