@@ -1,4 +1,4 @@
-"""Two ways through one control step of a robosuite environment: robosuite's own and a lean one.
+"""Two loops for a control step of a robosuite environment: robosuite's own and a lean one.
 
 robosuite spends two thirds of ``env.step`` in the Python of its controllers. :class:`ControlLoop` computes
 the same torques in one compiled function and observes once, at the end. Robot positions agree with
@@ -20,7 +20,7 @@ from warmprior.io.extras import require
 
 
 class Arm:
-    """One robot's indices, controller and current goal in the world, ``goal_pos`` and ``goal_mat``."""
+    """The indices, controller and current goal in the world, ``goal_pos`` and ``goal_mat``, of a robot."""
 
     def __init__(self, env: Any, robot: Any) -> None:
         composite = robot.composite_controller
@@ -54,7 +54,7 @@ class Arm:
         """Resolve an action into a goal pose in the world and the fingers' command."""
         controller = self.controller
         if controller.new_update:
-            # The pose is all that a goal depends on: spare the controller its full update.
+            # A goal depends only on the pose, so the controller's full update is not needed.
             controller.ref_pos = positions[self.site].copy()
             controller.ref_ori_mat = matrices[self.site].copy()
             controller.new_update = False
@@ -74,8 +74,7 @@ class Arm:
     ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Return the pose of the grip site, and the joints' velocities and positions, measured at the reset.
 
-        This reproduces that robosuite computes an episode's first torques from these, although it has moved
-        the joints since.
+        This reproduces robosuite's behaviour of computing the first torques from stale reset measurements.
         """
         controller = self.controller
         positions, columns = self.constants[:2]
@@ -87,7 +86,7 @@ class Arm:
 
 
 def is_plain_arm(robot: Any) -> bool:
-    """Whether a robot is of the kind that :class:`ControlLoop` steps: one OSC_POSE arm with a gripper."""
+    """Return True if :class:`ControlLoop` can step a robot: a single OSC_POSE arm with a gripper."""
     composite = robot.composite_controller
     controller = composite.part_controllers.get("right")
     return bool(
@@ -149,14 +148,14 @@ def _osc_torques(
 Observations = dict[str, np.ndarray]
 
 OBJECT_POSES = {"Lift", "NutAssemblySquare", "PickPlaceCan", "Stack", "ToolHang", "TwoArmTransport"}
-"""Environments whose ``"object"`` observation follows from positions alone."""
+"""The environments whose ``"object"`` observation depends only on positions."""
 
 
 class StepLoop:
-    """Steps a robosuite environment with ``env.step`` and reads robomimic's observations.
+    """A loop that steps a robosuite environment with ``env.step`` and reads robomimic's observations.
 
-    Its time limit is switched off: episodes end outside. Of the observations, in robomimic's names, only
-    ``keys`` are computed, all by default; a ``ValueError`` if there is none of a name.
+    The environment's time limit is switched off, because the wrapper ends episodes. Only the observations in
+    ``keys``, robomimic's names, are computed, all by default. Raises ValueError if a name is unknown.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -168,7 +167,7 @@ class StepLoop:
     def _select(self, keys: Sequence[str] | None) -> None:
         observables = self.env._observables
         for name, observable in observables.items():
-            # Inactive ones (grip poses) and the grippers' poses stay enabled: the object sensors read them.
+            # Inactive observables (grip poses) and grippers' poses stay enabled: object sensors read them.
             read = observable.modality == "object" or name.endswith(("eef_pos", "eef_quat"))
             if keys is not None and observable.is_active() and not read:
                 self.env.modify_observable(name, "enabled", name in keys)
@@ -183,24 +182,24 @@ class StepLoop:
             self._names = {name: key for name, key in self._names.items() if key in keys}
 
     def _bind(self) -> None:
-        """Look up what a reset may have replaced."""
+        """Look up the objects that a reset may have replaced."""
         sim = self.env.sim
         self._model, self._data = sim.model._model, sim.data._data
         self._bodies: dict[str, int] = {}
         self._arms = [Arm(self.env, robot) for robot in self.env.robots]
 
     def reset(self, seed: int) -> Observations:
-        """Start the episode that belongs to a seed; the global generators stay as they were."""
+        """Start the episode of a seed, without changing the global generators."""
         with isolated_numpy_seed(seed):
             self.env.reset()
         self._bind()
         return self._settled_observations()
 
     def set_state(self, state: np.ndarray) -> Observations:
-        """Put the simulation into a recorded state, ``[1 + nq + nv]`` as of :meth:`state`; observe.
+        """Restore a recorded state, ``[1 + nq + nv]`` as from :meth:`state`, and return its observations.
 
-        The gripper's command and the solver's starting point are not part of it, so the continuation is close
-        to the recorded one but not identical.
+        The state does not include the gripper's command and the solver's starting point, so the continuation
+        is close to the recorded one but not identical.
         """
         check_shape("state", state, (1 + self._model.nq + self._model.nv,))
         self.env.sim.set_state_from_flattened(state)
@@ -213,12 +212,12 @@ class StepLoop:
         return self.observations(refresh=True)
 
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
-        """Advance one control step (50 ms); what is observed, and whether the task is solved."""
+        """Advance one control step (50 ms); return observations, and True if the task is solved."""
         self.env.step(action)
         return self.observations(refresh=False), bool(self.env._check_success())
 
     def observations(self, refresh: bool = True) -> Observations:
-        """The observations, float64 under robomimic's names; of the last step unless ``refresh``."""
+        """Return observations, float64 under robomimic's names; those of the last step unless ``refresh``."""
         observations = self.env._get_observations(force_update=refresh)
         return {key: np.atleast_1d(observations[name]) for name, key in self._names.items()}
 
@@ -240,11 +239,11 @@ class StepLoop:
 
 
 class ControlLoop(StepLoop):
-    """Steps a robosuite environment as ``env.step`` does, about 2.5 times faster.
+    """A loop that steps a robosuite environment as ``env.step`` does, about 2.5 times faster.
 
-    Supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position and
-    orientation and no interpolation: what robomimic and MimicGen use. Any other robot or controller is a
-    ``ValueError``.
+    It supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position and
+    orientation and no interpolation, as in robomimic and MimicGen. Raises ValueError for any other robot or
+    controller.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -253,13 +252,13 @@ class ControlLoop(StepLoop):
                 composite = robot.composite_controller
                 what = f"{type(composite).__name__} with {sorted(composite.part_controllers)}"
                 raise ValueError(
-                    f"the lean loop has only plain OSC_POSE arms: control_loop='robosuite' for {what}"
+                    f"the lean loop needs plain OSC_POSE arms: use control_loop='robosuite' for {what}"
                 )
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
         super().__init__(env, keys)
         poses = low_dim_keys(len(env.robots))
-        #: Whether :meth:`look_back` gives all observations.
+        #: True if :meth:`look_back` returns all observations.
         self.looks_back = type(env).__name__ in OBJECT_POSES and not {*self._names.values()}.difference(poses)
 
     def _bind(self) -> None:
@@ -276,7 +275,7 @@ class ControlLoop(StepLoop):
         return self._observations_here(), success
 
     def advance(self, action: np.ndarray) -> bool:
-        """Advance one control step without observing; whether the task is solved."""
+        """Advance one control step without observing; return True if the task is solved."""
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         check_shape("action", action, (env.action_dim,))
         for substep in range(self._substeps):
@@ -315,10 +314,10 @@ class ControlLoop(StepLoop):
         return self.observations(refresh=True)
 
     def look_back(self, states: Sequence[np.ndarray]) -> list[Observations]:
-        """What the last :meth:`advance` would have observed, from :meth:`state` after each.
+        """Return the observations after the last calls of :meth:`advance`, from :meth:`state` after each.
 
-        Only for observations that are poses: others are gone. The first one's may be wrong: sensors of
-        objects relative to the gripper read poses that were cached a step before.
+        Only poses can be recovered. The first observations may be wrong, because sensors of objects relative
+        to the gripper read poses that were cached a step before.
         """
         data, observations = self._data, []
         for state in states:

@@ -1,4 +1,4 @@
-"""What a saved policy remembers of its environment, and the environment made from it again."""
+"""The description of an environment in a saved policy, and the environment built from it."""
 
 from __future__ import annotations
 
@@ -31,20 +31,22 @@ def environment_description(
     low_dim_keys: Sequence[str] | None = None,
     horizon: int | None = None,
 ) -> dict[str, Any]:
-    """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
+    """Return the description from which :func:`environment_of` builds an environment.
+
+    A :class:`~warmprior.WarmPriorActor` keeps it.
 
     Args:
         env_args: see :class:`RobosuiteEnv`.
-        style: likewise.
+        style: see :class:`RobosuiteEnv`.
         observation_steps: ``To``.
-        actions: those of the policy: the environment's own pose deltas, or absolute poses (see
+        actions: the policy's actions: the environment's own pose deltas, or absolute poses (see
             :class:`~warmprior.transforms.AbsoluteActions`).
-        images: of a policy that sees some: ``"cameras"`` and ``"size"``, see
-            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what it
-            sees besides, see :class:`RobosuiteEnv`.
+        images: options of a policy's images, if it sees any: ``"cameras"`` and ``"size"``, see
+            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, its
+            other observations, see :class:`RobosuiteEnv`.
 
     Keyword Args:
-        low_dim_keys: what a policy without images sees, where that is not the task's own.
+        low_dim_keys: observations of a policy without images, if they differ from the task's.
         horizon: see :class:`RobosuiteEnv`.
 
     Examples:
@@ -71,9 +73,9 @@ def environment_description(
 def robosuite_parts(
     description: Mapping[str, Any],
 ) -> tuple[Callable[..., RobosuiteEnv], dict[str, Transform]]:
-    """A function of further options of :class:`RobosuiteEnv`, and the transforms next to it, by argument.
+    """Return a builder that takes further options of :class:`RobosuiteEnv`, and its transforms by argument.
 
-    A ``ValueError`` if the environment takes no pose deltas, from which absolute actions are made.
+    Raises ValueError if actions are absolute and the environment does not take pose deltas.
     """
     options: dict[str, Any] = dict(description["robosuite"])
     transforms: dict[str, Transform] = {}
@@ -89,9 +91,9 @@ def robosuite_parts(
 
 
 def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
-    """What builds the environment that a policy was made for, and what builds the policy's transforms.
+    """Return a builder of the environment that a policy was made for, and one of the policy's transforms.
 
-    A ``ValueError`` if the policy keeps no description of an environment.
+    Raises ValueError if the policy keeps no description of an environment.
     """
     description: Any = actor.environment
     adapters: dict[str, Transform] = {}
@@ -109,24 +111,24 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Ca
     transforms = partial(
         policy_transforms,
         actor.prior,
-        # The environments' stays on the CPU, wherever the policy goes.
+        # The environments' normaliser stays on the CPU, even if the policy moves to a GPU.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
         observation_steps=description["observation_steps"],
         see_history=actor.sees_history,
-        # A guided policy reads what is left of its last chunk.
+        # A guided policy reads the delay's key.
         delay=None if actor.ode.guidance is None else 0,
     )
     return make_env, transforms
 
 
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
-    """The environment that a policy was made for, with the policy's own transforms.
+    """Build the environment that a policy was made for, with the policy's own transforms.
 
-    ``options`` are further ones of :class:`RobosuiteEnv`, or of :func:`registered_env`.
+    ``options`` are further options of :class:`RobosuiteEnv`, or of :func:`registered_env`.
 
     Raises:
-        ValueError: if the policy keeps no description of one.
+        ValueError: if the policy keeps no description of an environment.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -141,13 +143,13 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
 
 
 def environment_name(actor: WarmPriorActor) -> str | None:
-    """What robosuite or Gymnasium calls the environment that a policy was made for, if it is known."""
+    """Return the name in robosuite or Gymnasium of the environment that a policy was made for, if known."""
     description: Any = actor.environment
     if is_registered(description):
         return str(description["gymnasium"]["id"])
     try:
         return str(description["robosuite"]["env_args"]["env_name"])
-    except (KeyError, TypeError):  # none, or a description of the user's own
+    except (KeyError, TypeError):  # no description, or the user's own
         return None
 
 
@@ -155,7 +157,7 @@ _REGISTERED = {"id", "kwargs", "max_episode_steps", "success", "observation_keys
 
 
 def registered_description(environment: Mapping[str, Any], observation_steps: int) -> dict[str, Any]:
-    """What :func:`environment_of` needs of an environment that :func:`registered_env` builds."""
+    """Return the description of an environment that :func:`registered_env` builds."""
     return {
         "gymnasium": {name: environment.get(name) for name in sorted(_REGISTERED)},
         "observation_steps": observation_steps,
@@ -163,16 +165,16 @@ def registered_description(environment: Mapping[str, Any], observation_steps: in
 
 
 def is_registered(description: Any) -> bool:
-    """Whether it is what :func:`registered_description` gives."""
+    """Return True if a description has the form of :func:`registered_description`."""
     try:
-        known = description.keys() == {"gymnasium", "observation_steps"}
-        return known and description["gymnasium"].keys() == _REGISTERED
+        complete = description.keys() == {"gymnasium", "observation_steps"}
+        return complete and description["gymnasium"].keys() == _REGISTERED
     except AttributeError:
         return False
 
 
 def _is_complete(description: Any) -> bool:
-    """Whether it is what :func:`environment_description` gives, and no other option reaches a simulator."""
+    """Return True if a description has only the entries of :func:`environment_description`."""
     try:
         images = description.get("images", dict.fromkeys(_IMAGES))
         return (
@@ -181,5 +183,5 @@ def _is_complete(description: Any) -> bool:
             and description.get("actions", "delta") in ("delta", "absolute")
             and images.keys() == set(_IMAGES)
         )
-    except AttributeError:  # none, or one of the user's own
+    except AttributeError:  # no description, or the user's own
         return False

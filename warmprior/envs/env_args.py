@@ -1,4 +1,4 @@
-"""What robomimic's files say about their environment and actions, in the terms of robosuite 1.5."""
+"""Descriptions of environments and actions in robomimic's files, translated to robosuite 1.5."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _modernize_controller(config: dict[str, Any]) -> dict[str, Any]:
         delta = part.pop("control_delta", True)
         part.setdefault("input_type", "delta" if delta else "absolute")
         # Up to robosuite 1.4 a delta was in the world frame; from 1.5 on it is in the robot's base
-        # frame unless the file says otherwise. Bases that face each other make the two differ.
+        # frame unless the file says otherwise. The two differ for bases that face each other.
         part.setdefault("input_ref_frame", "world" if old else "base")
         part.setdefault("gripper", {"type": "GRIP"})
     return config
@@ -44,16 +44,16 @@ def _modernize_controller(config: dict[str, Any]) -> dict[str, Any]:
 def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
     """Rewrite the ``env_args`` of any robomimic file for robosuite 1.5.
 
-    :doc:`/data` has a table of what changes. Some files published for 1.5 still carry the old description, so
-    what the file contains decides, not its version. The dynamics of old data are kept
-    (``lite_physics=False``). Applying the function twice changes nothing more.
+    :doc:`/data` has a table of the changes. Some files published for 1.5 still have the old description, so
+    the content of the file decides, not its version. The dynamics of old data are kept
+    (``lite_physics=False``). A second application changes nothing.
 
     Args:
         env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``, with ``env_name`` and
-            ``env_kwargs``. Not modified.
+            ``env_kwargs``. It is not modified.
 
     Returns:
-        A deep copy, from which ``robosuite.make(new["env_name"], **new["env_kwargs"])`` works.
+        A deep copy for ``robosuite.make(new["env_name"], **new["env_kwargs"])``.
 
     Raises:
         ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``env_kwargs`` names another environment.
@@ -90,20 +90,23 @@ def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
         kwargs["env_configuration"] = layout.removeprefix("single-arm-")
     if "mount_types" in kwargs:
         kwargs["base_types"] = kwargs.pop("mount_types")
-    # The index of a GPU on the machine that recorded the data.
+    # This is the index of a GPU on the machine that recorded the data.
     kwargs.pop("render_gpu_device_id", None)
     return new
 
 
 def _arm_controller(env_args: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Keyword arguments of an environment for robosuite 1.5, and what they say of the first arm."""
+    """Return an environment's keyword arguments for robosuite 1.5, and those of its first arm."""
     kwargs = modernize_env_args(env_args)["env_kwargs"]
     config = kwargs.get("controller_configs") or {"body_parts": {"right": {"type": "OSC_POSE"}}}
     return kwargs, (config[0] if isinstance(config, list) else config)["body_parts"]["right"]
 
 
 def declared_actions(env_args: Mapping[str, Any]) -> tuple[str, str] | None:
-    """What an ``OSC_POSE`` controller reads, ``"delta"`` or ``"absolute"``, and its frame; or ``None``."""
+    """Return the input type of an ``OSC_POSE`` controller, ``"delta"`` or ``"absolute"``, and its frame.
+
+    The result is ``None`` for another controller.
+    """
     _, part = _arm_controller(env_args)
     if part.get("type") != "OSC_POSE":
         return None
@@ -111,10 +114,10 @@ def declared_actions(env_args: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """In which units and frame an environment reads its pose deltas.
+    """Return the units and the frame of an environment's pose deltas.
 
-    ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
-    ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
+    The units are ``output_max`` ``[6]`` float64, the motion at an input of 1 (3 in metres, 3 in radians). The
+    frame is ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
 
     Raises:
         ValueError: if the controller is not an ``OSC_POSE`` one fed with deltas in ``[-1, 1]``.
@@ -130,7 +133,7 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     kwargs, part = _arm_controller(env_args)
     if part.get("type") != "OSC_POSE" or part.get("input_type", "delta") != "delta":
         kind = f"{part.get('type')} with input_type={part.get('input_type')!r}"
-        raise ValueError(f"expected OSC_POSE deltas, got {kind}; read the actions as they are")
+        raise ValueError(f"expected OSC_POSE deltas, got {kind}; use the actions as recorded")
     output_max = torch.as_tensor(part.get("output_max", _OUTPUT_MAX), dtype=torch.float64).expand(6)
     output_min = torch.as_tensor(part.get("output_min", -output_max), dtype=torch.float64).expand(6)
     limits = (part.get("input_min", -1), part.get("input_max", 1))
@@ -161,7 +164,7 @@ def absolute_actions(
     output_max: Tensor | Sequence[float] = _OUTPUT_MAX,
     base_rotation: Tensor | None = None,
 ) -> Tensor:
-    """Turn pose deltas into the poses they ask for, in the world frame.
+    """Turn pose deltas into the poses that they target, in the world frame.
 
     The goal position is ``eef_pos + output_max[:3] * clip(delta)`` and the goal orientation
     ``exp(output_max[3:] * clip(turn)) @ R_site``. ``R_site`` is the frame of the gripper site; robomimic's
@@ -171,16 +174,16 @@ def absolute_actions(
         actions: ``[..., 7]`` or, for two arms, ``[..., 14]``: position delta, rotation delta and gripper.
         eef_pos: ``[..., 3]`` or ``[..., 6]`` gripper positions before the action, in metres.
         eef_quat: ``[..., 4]`` or ``[..., 8]`` hand orientations before the action, ``(x, y, z, w)``.
-        output_max: ``[6]``, what an input of 1 means, in metres and radians.
-        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; ``None`` if they are in it
-            (see :func:`delta_conventions`).
+        output_max: ``[6]``, the motion at an input of 1, in metres and radians.
+        base_rotation: ``[arms, 3, 3]``, the rotation from the frame of the deltas to the world; ``None`` if
+            the frames are the same (see :func:`delta_conventions`).
 
     Returns:
-        ``[..., 10]`` or ``[..., 20]`` in the dtype of ``actions``: per arm the position in metres, the first
-        two rows of the rotation matrix, and the gripper.
+        Poses ``[..., 10]`` or ``[..., 20]`` in the dtype of ``actions``: per arm the position in metres, the
+        first two rows of the rotation matrix, and the gripper.
 
     Raises:
-        ValueError: if a width does not belong to one or two arms, or the widths disagree.
+        ValueError: if a width does not fit one or two arms, or the widths disagree.
 
     Examples:
         >>> import torch
@@ -198,7 +201,7 @@ def absolute_actions(
     scale = torch.as_tensor(output_max, dtype=torch.float64, device=delta.device)
     step = (delta[..., :6].clamp(-1, 1) * scale).unflatten(-1, (2, 3))
     if base_rotation is not None:
-        # Turning both vectors is enough: B exp(r) B^T = exp(B r).
+        # Both vectors are rotated, because B exp(r) B^T = exp(B r).
         step = step @ base_rotation.to(step).mT
     goal = position + step[..., 0, :]
     turned = matrix_to_rotation_6d(rotvec_to_matrix(step[..., 1, :]) @ rotation)

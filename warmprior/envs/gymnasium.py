@@ -1,4 +1,4 @@
-"""Any Gymnasium environment, as policies of this library are played in it."""
+"""Gymnasium environments with the keys that policies of this library need."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warmprior.keys import OBSERVATION, SUCCESS
 
 
 class _Infos(BaseInfoDictReader):
-    """Reads numbers and flags of ``info`` as ``[1]``; what a step, or a reset, leaves out is 0."""
+    """A reader of numbers and flags in ``info`` as ``[1]``; entries missing after a step or reset are 0."""
 
     def __init__(self, dtypes: Mapping[str, torch.dtype]) -> None:
         self._dtypes = dict(dtypes)
@@ -36,18 +36,18 @@ class _Infos(BaseInfoDictReader):
 
 
 class _Gym(GymWrapper):
-    """An episode after ``set_seed(seed)`` is that of ``reset(seed=seed)``, with one reset."""
+    """A wrapper whose episode after ``set_seed(seed)`` is that of a single ``reset(seed=seed)``."""
 
     _next: int | None = None
     ends_at: str | None = None
-    """A flag that ends the episode, of those that ``info`` says."""
+    """The flag in ``info`` that ends the episode."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        found = super()._step(tensordict)
-        if self.ends_at is not None and found[self.ends_at].any():
+        result = super()._step(tensordict)
+        if self.ends_at is not None and result[self.ends_at].any():
             for flag in ("terminated", "done"):
-                found.set(flag, torch.ones_like(found[flag]))
-        return found
+                result.set(flag, torch.ones_like(result[flag]))
+        return result
 
     def _set_seed(self, seed: int | None) -> None:
         self._next = seed
@@ -66,18 +66,18 @@ def gym_env(
     observation_keys: Sequence[str] = (),
     terminate_on_success: bool = False,
 ) -> TransformedEnv:
-    """A Gymnasium environment with ``"observation"`` ``[d_o]``, float32, and what its ``info`` says.
+    """Wrap a Gymnasium environment, with ``"observation"`` ``[d_o]``, float32, and entries of its ``info``.
 
     Args:
         env: a Gymnasium environment whose action is one vector.
-        success: name of the ``info`` that says whether the task is solved; bool ``[1]`` under the same key.
-        measures: names of further numbers in ``info``, float32 ``[1]`` each.
-        observation_keys: entries of a dictionary of observations, concatenated in this order, and
-            ``"outer/inner"`` of one in another; by default all.
-        terminate_on_success: whether solving the task ends the episode.
+        success: name of the entry of ``info`` that is True once the task is solved; written as bool ``[1]``.
+        measures: names of further numbers in ``info``, written as float32 ``[1]``.
+        observation_keys: entries of a dictionary of observations, concatenated in this order, with
+            ``"outer/inner"`` in nested ones; by default all.
+        terminate_on_success: True ends the episode once the task is solved.
 
     Raises:
-        KeyError: if there is no such entry.
+        KeyError: if an entry does not exist.
 
     Examples:
         >>> import gymnasium
@@ -104,7 +104,7 @@ def gym_env(
 
 
 REGISTERING = ("gymnasium_robotics", "gym_pusht")
-"""Packages that register environments when they are imported, where they are installed."""
+"""The packages that register environments when imported; they are imported if installed."""
 
 
 def registered_env(
@@ -114,21 +114,22 @@ def registered_env(
     horizon: int | None = None,
     render_mode: str | None = None,
 ) -> TransformedEnv:
-    """An environment of Gymnasium's registry, as data or a policy describe it.
+    """Build an environment of Gymnasium's registry from a description in data or a policy.
 
-    Nothing that a description names is imported: its environment has to be registered, by a package of
-    :data:`REGISTERING` or one that you import before.
+    Nothing that a description names is imported: a package in :data:`REGISTERING`, or one that you import
+    before, must register the environment.
 
     Args:
         description: ``"id"`` and ``"kwargs"`` of ``gymnasium.make``, ``"max_episode_steps"``, and
-            ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is said under ``"success"``.
+            ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is written under
+            ``"success"``.
         terminate_on_success: see :func:`gym_env`.
-        horizon: steps per episode, in place of ``"max_episode_steps"``.
+        horizon: steps per episode, instead of ``"max_episode_steps"``.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
 
     Raises:
-        ImportError: if no environment of this name is registered.
-        ValueError: if it has wrappers, which would be imported.
+        ImportError: if no environment with this name is registered.
+        ValueError: if the description has wrappers, which would be imported.
 
     Examples:
         >>> from warmprior.envs import registered_env

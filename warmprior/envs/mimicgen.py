@@ -1,4 +1,4 @@
-"""MimicGen's tasks under robosuite 1.5; their package is written for 1.4."""
+"""MimicGen's tasks under robosuite 1.5, although their package is written for 1.4."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ _SINGLE_ARM = "robosuite.environments.manipulation.single_arm_env"
 
 
 def is_mimicgen(env_name: str) -> bool:
-    """Whether an environment is one of MimicGen's, by its name: they end in a variant, as ``Stack_D0``."""
+    """Return True if a name is that of a MimicGen environment, which ends in a variant: ``Stack_D0``."""
     return re.search(r"_[DO]\d$", env_name) is not None
 
 
 def find_mimicgen() -> Path:
-    """The folder of NVlabs' package, found without running its code; an ``ImportError`` if there is none."""
+    """Return the folder of NVlabs' package, without running its code; raise ImportError without one."""
     spec = find_spec("mimicgen")
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     for folder in folders:
         if all((folder / "envs" / "robosuite" / f"{task}.py").is_file() for task in _TASKS):
             return folder
-    # A bare folder of the name, such as the clone beside which Python runs, is no package.
+    # A folder with this name but no package in it, such as a clone in the working directory, is not enough.
     if spec is None or spec.origin is None:
         raise ImportError(f"MimicGen's tasks need NVlabs' package, not the package index's; run: {_INSTALL}")
     where = ", ".join(map(str, folders)) or spec.origin
@@ -40,10 +40,10 @@ def find_mimicgen() -> Path:
 
 
 def register_mimicgen() -> None:
-    """Make MimicGen's tasks known to ``robosuite.make``. A second call changes nothing.
+    """Register MimicGen's tasks for ``robosuite.make``. A second call changes nothing.
 
-    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index; the
-    one of that name there is another project, and is refused without being imported.
+    The package must be that of https://github.com/NVlabs/mimicgen, which is not on the package index; the
+    package of that name there is another project, and is rejected without being imported.
 
     Raises:
         ImportError: if the package is missing, another one, or cannot be imported.
@@ -57,7 +57,7 @@ def register_mimicgen() -> None:
     folder = find_mimicgen()
     _restore_robosuite_14()
     try:
-        # It prints what further packages its other tasks need.
+        # The import prints the packages that other tasks need.
         with redirect_stdout(io.StringIO()):
             for task in _TASKS:
                 import_module(f"mimicgen.envs.robosuite.{task}")
@@ -66,7 +66,7 @@ def register_mimicgen() -> None:
 
 
 def _restore_robosuite_14() -> None:
-    """Add what MimicGen uses of robosuite 1.4; robosuite's own tasks use none of it."""
+    """Add the parts of robosuite 1.4 that MimicGen uses, and robosuite's own tasks do not."""
     if _SINGLE_ARM in sys.modules:
         return
     from robosuite.environments.manipulation.manipulation_env import ManipulationEnv

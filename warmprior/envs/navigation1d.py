@@ -1,4 +1,4 @@
-"""The one-dimensional navigation toy: two obstacles, six demonstrations, two modes everywhere (Sec. 5.2)."""
+"""The one-dimensional navigation toy task: two obstacles, six demonstrations, two modes (Sec. 5.2)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ OBSTACLES = (-0.45, 0.45)
 HALF_WIDTH, HALF_HEIGHT = 0.12, 0.45
 SCALES = (0.85, 1.0, 1.15)
 OCTAVES = 4
-"""Of sines and cosines beside the position: without them small networks underfit at small budgets."""
+"""The octaves of sines and cosines added to the position: without them small networks underfit."""
 UNDECIDED = 0.05
-"""Heights nearer to the axis than this belong to neither side (no demonstration comes below 0.17)."""
+"""The distance from the axis within which heights are on neither side (demonstrations keep 0.17)."""
 
 
 def navigation_positions() -> Tensor:
-    """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1.
+    """Return the horizontal positions of the 64 steps, ``[64]``, from -1 to 1.
 
     Examples:
         >>> from warmprior.envs import navigation_positions
@@ -37,7 +37,7 @@ def navigation_positions() -> Tensor:
 
 
 def navigation_heights() -> Tensor:
-    """Heights of the six demonstrations, ``[6, 64]``: three above both obstacles, three below.
+    """Return the heights of the six demonstrations, ``[6, 64]``: three above both obstacles, three below.
 
     A demonstration is a scaled profile with a bump over each obstacle; the two sides come closest (0.35
     apart) at the start, between the obstacles, and at the end.
@@ -55,7 +55,7 @@ def navigation_heights() -> Tensor:
 
 
 def _middles() -> list[int]:
-    """The steps above the middles of the obstacles."""
+    """Return the steps at the middles of the obstacles."""
     return [int((navigation_positions() - c).abs().argmin()) for c in OBSTACLES]
 
 
@@ -65,10 +65,10 @@ def _features(x: Tensor, octaves: int) -> Tensor:
 
 
 def navigation_demonstrations(octaves: int = OCTAVES) -> TensorDict:
-    """The six demonstrations as contiguous steps ``[384]``, ready for :class:`~warmprior.ActionWindow`.
+    """Return the six demonstrations as contiguous steps ``[384]`` for :class:`~warmprior.ActionWindow`.
 
-    ``"observation"`` ``[384, 1 + 2 * octaves]`` is the position, with its sines and cosines, ``"action"``
-    ``[384, 1]`` the height, in [-1, 1] without normalisation, ``"episode"`` ``[384]``.
+    ``"observation"`` ``[384, 1 + 2 * octaves]`` is the position with its sines and cosines, ``"action"``
+    ``[384, 1]`` the height, in [-1, 1] without normalisation, and ``"episode"`` ``[384]`` the demonstration.
 
     Examples:
         >>> from warmprior.envs import navigation_demonstrations
@@ -89,14 +89,14 @@ def navigation_demonstrations(octaves: int = OCTAVES) -> TensorDict:
 
 
 def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
-    """Whether the segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
+    """Return a mask of segments between consecutive points that enter an obstacle, bool ``[*B, T - 1]``.
 
     The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
     """
     x0, x1, y0, y1 = x[..., :-1], x[..., 1:], y[..., :-1], y[..., 1:]
     hit = torch.zeros_like(y0, dtype=torch.bool)
     for c in OBSTACLES:
-        # The part of the segment above the obstacle's width, as shares of its length.
+        # The part of the segment within the obstacle's width, as shares of its length.
         enter = ((c - HALF_WIDTH - x0) / (x1 - x0)).clamp(0, 1)
         leave = ((c + HALF_WIDTH - x0) / (x1 - x0)).clamp(0, 1)
         low, high = y0 + enter * (y1 - y0), y0 + leave * (y1 - y0)
@@ -106,10 +106,10 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
 
 
 class NavigationEnv(EnvBase):
-    """An agent that moves from left to right at constant speed and chooses its height at every step.
+    """An environment whose agent moves right at constant speed and chooses its height at every step.
 
     There are no dynamics: the action *is* the height, the position advances by itself, and an episode lasts
-    64 steps. The environment holds no state: what it needs arrives in the tensordict.
+    64 steps. The environment holds no state; it reads everything from the tensordict.
 
     =================  ===================  ===============================================
     key                shape                meaning
@@ -119,23 +119,24 @@ class NavigationEnv(EnvBase):
     ``"reward"``       ``[*B, 1]`` float    1 at the end of an episode that succeeds
     ``"step_index"``   ``[*B, 1]`` int64    steps done, 0 to 64
     ``"height"``       ``[*B, 1]`` float    the last action
-    ``"collided"``     ``[*B, 1]`` bool     whether the path entered an obstacle
-    ``"success"``      ``[*B, 1]`` bool     whether it ended without collision, on the route
+    ``"collided"``     ``[*B, 1]`` bool     True if the path entered an obstacle
+    ``"success"``      ``[*B, 1]`` bool     True if it ended without collision, on the route
     =================  ===================  ===============================================
 
     With a route it is a small task with a sparse reward: an episode ends at the first collision, and at the
-    first obstacle passed on the wrong side, with reward 0. The demonstrations do not know the route, so that
-    a policy cloned from them succeeds on a share of the episodes and reinforcement learning has something to
-    find.
+    first obstacle passed on the wrong side, with reward 0. The demonstrations are independent of the route,
+    so a policy cloned from them succeeds in a share of the episodes, and reinforcement learning can improve
+    it.
 
     Args:
-        route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); either by default.
-        octaves: of sines and cosines beside the position, ``d_o = 1 + 2 * octaves``; the paper has none.
+        route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); any side by default.
+        octaves: octaves of sines and cosines added to the position, ``d_o = 1 + 2 * octaves``; the paper has
+            none.
         batch_size: ``*B``, independent agents.
-        device: of all tensors.
+        device: device of all tensors.
 
     Raises:
-        ValueError: if the route is not two of these numbers, or ``octaves`` no whole number of at least 0.
+        ValueError: if the route is not two of these numbers, or ``octaves`` is not a whole number >= 0.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -148,7 +149,7 @@ class NavigationEnv(EnvBase):
     """
 
     strided_seeds = True
-    """Every seed starts the same episode, so each row plays whichever :func:`evaluate` expects."""
+    """True, since every seed starts the same episode, and so any row can play any seed."""
 
     def __init__(
         self,
@@ -176,12 +177,12 @@ class NavigationEnv(EnvBase):
         position = Bounded(-1, 1, (*self.batch_size, 1 + 2 * octaves), device=device)
         entries = {keys.OBSERVATION: position, "success": flag, **carried}
         self.observation_spec = Composite(entries, shape=self.batch_size).clone()
-        # Policies may leave the corridor of the demonstrations: that is a result, not an error.
+        # Unbounded, because a policy that leaves the corridor of the demonstrations is a valid result.
         self.action_spec = Unbounded(shape, device=device)
         self.reward_spec = Unbounded(shape, device=device)
 
     def _at(self, step: Tensor) -> Tensor:
-        """Position of a step; the last one stays."""
+        """Return the position of a step; steps after the end have the last one's."""
         return -1.0 + 2.0 / (STEPS - 1) * step.clamp(max=STEPS - 1)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDictBase:
@@ -222,12 +223,12 @@ class NavigationEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing in the environment is random."""
+        """Do nothing, because nothing in the environment is random."""
 
 
 @dataclass(frozen=True)
 class NavigationMetrics:
-    """What became of a set of rollouts.
+    """The statistics of a set of rollouts.
 
     Attributes:
         switch_rate: share of chunk boundaries at which the side changes, among those with a side before and
@@ -258,10 +259,10 @@ class NavigationMetrics:
 
 
 def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
-    """Judge executed heights ``[n, 64]``, of which each decision executed ``chunk_length``.
+    """Compute the statistics of executed heights ``[n, 64]``, with ``chunk_length`` steps per decision.
 
     Raises:
-        ValueError: if the heights have another shape, are not finite, or a chunk is the whole episode.
+        ValueError: if the heights have another shape, are not finite, or a chunk spans the whole episode.
 
     Examples:
         >>> from warmprior.envs import navigation_heights, navigation_metrics

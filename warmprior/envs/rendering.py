@@ -1,7 +1,7 @@
-"""Off-screen rendering: which OpenGL backend works here, and one frame on demand.
+"""Off-screen rendering: the choice of an OpenGL backend, and single frames.
 
 robosuite overrides the environment variable ``MUJOCO_GL`` when imported. Nothing here runs until a frame is
-asked for, so machines without OpenGL can still simulate.
+needed, so machines without OpenGL can still simulate.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from warmprior.checks import check_choice
 from warmprior.io.extras import require
 from warmprior.io.workers import stop_forking
 
-# EGL first: it uses a GPU where there is one. Both render the same pixels in software.
+# EGL first, because it uses a GPU if there is one. Both render the same pixels in software.
 _BACKENDS = ("egl", "osmesa")
-_BUFFER = (640, 480)  # robosuite's; an image is a corner of it, and its edges look accordingly
+_BUFFER = (640, 480)  # as in robosuite; an image is a corner of it, so its size affects smoothed edges
 _MOST_GEOMS = 10_000
 _rendering_process: int | None = None
 _OPEN: weakref.WeakSet[CameraRenderer] = weakref.WeakSet()
@@ -37,10 +37,10 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 @functools.cache
 def rendering_backend() -> str | None:
-    """The OpenGL backend that renders without a display, ``"egl"`` or ``"osmesa"``; ``None`` without one.
+    """Return the OpenGL backend that renders without a display, ``"egl"``, ``"osmesa"`` or ``None``.
 
-    ``MUJOCO_GL`` is tried first if it names one. Each is tried in a process of its own, because a failed
-    attempt cannot be undone; the answer is kept.
+    ``MUJOCO_GL`` is tried first if it names one. Each is tried in a separate process, because a failed
+    attempt cannot be undone; the result is cached.
 
     Examples:
         >>> from warmprior.envs import rendering_backend
@@ -59,10 +59,10 @@ def rendering_backend() -> str | None:
 
 
 def require_rendering() -> str:
-    """The backend that renders here; a ``RuntimeError`` that names what to install if there is none."""
+    """Return the backend that renders here; raise RuntimeError with packages to install if none does."""
     backend = rendering_backend()
     if backend is None:
-        require("mujoco", "sim")  # without which no backend could be tried
+        require("mujoco", "sim")  # no backend can be tried without mujoco
         raise RuntimeError(
             "neither EGL nor OSMesa works here: apt-get install libegl1 libegl-mesa0 or libosmesa6"
         )
@@ -70,9 +70,9 @@ def require_rendering() -> str:
 
 
 class CameraRenderer:
-    """Renders the cameras of a MuJoCo model, an ``MjModel``, at given positions, aside from any episode.
+    """A renderer of the cameras of a MuJoCo model, an ``MjModel``, independent of any episode.
 
-    ``fast`` leaves out reflections, shadows and the smoothing of edges: three to five times faster, and the
+    ``fast`` leaves out reflections, shadows and smooth edges: it is three to five times faster, and its
     images differ by 1 to 2 of 255 on average.
     """
 
@@ -80,7 +80,7 @@ class CameraRenderer:
         backend = require_rendering()
         _check_process()
         os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
-        # The backend's own module: mujoco.GLContext is that of the variable when mujoco was imported.
+        # The backend's own module, because mujoco.GLContext was chosen when mujoco was imported.
         gl = importlib.import_module(f"mujoco.{backend}").GLContext
         mujoco = self._mujoco = require("mujoco", "sim")
         self.model, self.height, self.width = model, height, width
@@ -106,15 +106,15 @@ class CameraRenderer:
             sizes.offwidth, sizes.offheight, quality.offsamples = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if not _OPEN:
-            # After mujoco's own, which ends OpenGL: what is registered last runs first.
+            # Registered after mujoco's own handler, which ends OpenGL, so that this one runs first.
             atexit.register(_close_all)
         _OPEN.add(self)
 
     def close(self) -> None:
-        """Give back what OpenGL holds."""
+        """Free the resources of OpenGL."""
         if self in _OPEN:
             _OPEN.discard(self)
-            if os.getpid() != _rendering_process:  # they are the parent's
+            if os.getpid() != _rendering_process:  # the resources belong to the parent process
                 return
             self._gl.make_current()
             self._context.free()
@@ -124,7 +124,7 @@ class CameraRenderer:
         self.close()
 
     def render(self, camera: str, qpos: np.ndarray) -> np.ndarray:
-        """The image of a camera, uint8 ``[height, width, 3]``, the right way up, at joints ``[nq]``."""
+        """Return a camera's image, uint8 ``[height, width, 3]``, upright, at joint positions ``[nq]``."""
         _check_process()
         mujoco, model, data = self._mujoco, self.model, self._data
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
@@ -146,10 +146,10 @@ class CameraRenderer:
 
 
 def _check_process() -> None:
-    """Raise RuntimeError in the fork of a process that rendered, which would wait for OpenGL for ever."""
+    """Raise RuntimeError in the fork of a process that rendered, which would wait for OpenGL forever."""
     global _rendering_process
     if _rendering_process not in (None, os.getpid()):
-        raise RuntimeError("OpenGL does not survive the fork of a process that rendered: start it by spawn")
+        raise RuntimeError("OpenGL does not work in the fork of a process that rendered: start it by spawn")
     _rendering_process = os.getpid()
     stop_forking()
 
@@ -160,14 +160,14 @@ def _close_all() -> None:
 
 
 class EnvRenderers:
-    """The renderers of a robosuite environment, made when they are needed."""
+    """The renderers of a robosuite environment, built when they are needed."""
 
     def __init__(self, env: Any, *, fast: bool = False) -> None:
         self.env, self.fast = env, fast
         self._made: dict[tuple[int, int], CameraRenderer] = {}
 
     def render(self, camera: str, height: int, width: int, qpos: np.ndarray | None = None) -> np.ndarray:
-        """The image of a camera, see :meth:`CameraRenderer.render`; of the present state by default."""
+        """Return a camera's image, by default of the current state, see :meth:`CameraRenderer.render`."""
         model = self.env.sim.model._model
         renderer = self._made.get((height, width))
         if renderer is None or renderer.model is not model:  # a reset may load another one

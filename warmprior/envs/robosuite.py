@@ -26,18 +26,18 @@ _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 _FLAGS = keys.SUCCESS, "terminated", "truncated", "done"
 
 _Flags = tuple[bool, bool, bool, bool]
-"""Of a control step, in the order of the above."""
+"""The flags of a control step, in the order of the keys above."""
 
 
 class RobosuiteEnv(EnvBase):
-    """A robosuite task by its short name, the environment of a robomimic file, or any of your own.
+    """A robosuite environment: a task by its short name, that of a robomimic file, or your own.
 
     ==================  =============================================================
     key                 shape, dtype
     ==================  =============================================================
     ``"observation"``   ``[d_o]`` float32: ``low_dim_keys``, concatenated
-    ``"pixels"``        ``[h, w, 3]`` uint8, the right way up; only ``from_pixels``. Of several
-                        cameras nested under their names, as ``("pixels", "agentview")``
+    ``"pixels"``        ``[h, w, 3]`` uint8, upright; only ``from_pixels``. Several cameras are
+                        nested under their names, as ``("pixels", "agentview")``
     ``"sim_state"``     ``[1 + nq + nv]`` float64, time, positions and velocities; only ``sim_state``
     ``"eef_pose"``      ``[arms, 3, 4]`` float32; only ``eef_pose``
     ``"success"``       ``[1]`` bool
@@ -50,7 +50,7 @@ class RobosuiteEnv(EnvBase):
     The n-th reset after :meth:`set_seed` (or after construction) plays the episode of simulator seed ``seed +
     seed_offset + n * seed_stride``. With ``seed_offset=i, seed_stride=workers`` and the same seed for all
     (``set_seed(seed, static_seed=True)``), worker ``i`` of a :class:`~torchrl.envs.ParallelEnv` plays every
-    ``workers``-th episode. The global generators of numpy and Python are left as they were.
+    ``workers``-th episode. The global generators of numpy and Python are not changed.
 
     Args:
         task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
@@ -58,32 +58,32 @@ class RobosuiteEnv(EnvBase):
         env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or MimicGen file
             of any version.
         env: instead of both: a robosuite environment. Its own time limit, reward and renderer are not used.
-        style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
+        style: style of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
         low_dim_keys: robomimic names of the observations to concatenate; by default ``"object"`` and each
             arm's pose and gripper.
         horizon: time limit in control steps; by default the task's, or else the environment's own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`, ``"robosuite"`` for
-            ``env.step``; by default the first where it supports the robots.
-        from_pixels: render ``camera`` at every step. Policies that see images need them at decisions alone,
-            where :class:`~warmprior.transforms.CameraImages` renders them.
-        camera: the camera rendered, or several; ``None`` for the task's first, or ``"agentview"``.
+            ``env.step``; by default the lean loop if it supports the robots.
+        from_pixels: True renders ``camera`` at every step. Policies that see images need them only at
+            decisions, for which :class:`~warmprior.transforms.CameraImages` renders them.
+        camera: name of the rendered camera, or several; ``None`` for the task's first, or ``"agentview"``.
         camera_size: side of the image in pixels, or its height and width.
         fast_rendering: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        sim_state: tell the simulator's state.
-        eef_pose: tell the grippers' poses in the world: rotation and, in the last column, position in metres
-            (see :class:`~warmprior.transforms.AbsoluteActions`).
-        seed: of the first episodes.
-        seed_offset: added to every seed.
-        seed_stride: between the seeds of consecutive episodes.
-        terminate_on_success: end the episode once the task is solved.
-        device: of the tensordicts.
+        sim_state: True writes the simulator's state.
+        eef_pose: True writes the grippers' poses in the world: rotation and, in the last column, position in
+            metres (see :class:`~warmprior.transforms.AbsoluteActions`).
+        seed: seed of the first episode.
+        seed_offset: offset added to every seed.
+        seed_stride: difference between the seeds of consecutive episodes.
+        terminate_on_success: True ends the episode once the task is solved.
+        device: device of the tensordicts.
 
     Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not where the task is one of its.
+        ImportError: if robosuite is not installed, or MimicGen is not and the task is one of its tasks.
         ValueError: if the task is unknown, not exactly one of ``task``, ``env_args`` and ``env`` is given, an
             option is out of range, an observation or camera does not exist, or the lean loop does not support
             the robots.
-        RuntimeError: if pixels are asked for and nothing here can render.
+        RuntimeError: if ``from_pixels`` is True and this machine cannot render.
 
     Examples:
         >>> from warmprior.envs import RobosuiteEnv
@@ -117,7 +117,7 @@ class RobosuiteEnv(EnvBase):
         terminate_on_success: bool = True,
         device: torch.device | str | None = None,
     ) -> None:
-        if sum(given is not None for given in (task, env_args, env)) != 1:
+        if sum(choice is not None for choice in (task, env_args, env)) != 1:
             raise ValueError("give one of task, env_args and env")
         check_choice("style", style, STYLES)
         if control_loop is not None:
@@ -125,7 +125,7 @@ class RobosuiteEnv(EnvBase):
         check_whole_numbers(seed_stride=seed_stride, horizon=1 if horizon is None else horizon)
         size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
         if len(size) != 2 or min(size) < 1:
-            raise ValueError(f"camera_size is a side or (height, width), got {camera_size!r}")
+            raise ValueError(f"camera_size must be a side or (height, width), got {camera_size!r}")
         if task is not None:
             env_args = task_env_args(task)
         elif env_args is not None:
@@ -137,15 +137,15 @@ class RobosuiteEnv(EnvBase):
             camera = "agentview" if spec is None else spec.cameras[0]
         cameras = (camera,) if isinstance(camera, str) else tuple(camera)
         if not cameras or len(set(cameras)) < len(cameras):
-            raise ValueError(f"camera is a name, or different ones, got {camera!r}")
+            raise ValueError(f"camera must be a name, or several different names, got {camera!r}")
         super().__init__(device=device)
         self.task = spec
         self._env = env if env_args is None else make_simulator(env_args)
         if control_loop is None:
             control_loop = "lean" if all(map(is_plain_arm, self._env.robots)) else "robosuite"
         if horizon is None:
-            # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
-            # waits for a success that may never come.
+            # Also if the environment itself has no limit (``ignore_done``): an evaluation would wait for a
+            # success that may never come.
             horizon = self._env.horizon
             check_whole_numbers(horizon=horizon)
         default = default_keys(len(self._env.robots))
@@ -169,7 +169,7 @@ class RobosuiteEnv(EnvBase):
 
     @property
     def loop(self) -> StepLoop:
-        """The control loop, which holds the simulator state and the poses of bodies and sites."""
+        """The control loop, with access to the simulator's state and the poses of bodies and sites."""
         return self._loop
 
     def render_frame(
@@ -178,13 +178,13 @@ class RobosuiteEnv(EnvBase):
         size: int | tuple[int, int] | None = None,
         state: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Render a state, with or without ``from_pixels``: uint8 ``[h, w, 3]``, the right way up.
+        """Return a picture of a state, uint8 ``[h, w, 3]``, upright, with or without ``from_pixels``.
 
-        By default the first camera shows the present state in ``camera_size``; a state is given as
-        ``"sim_state"`` tells it. The episode goes on as if nothing was rendered.
+        By default the first camera shows the current state in ``camera_size``; a state has the form of
+        ``"sim_state"``. Rendering does not affect the episode.
 
         Raises:
-            ValueError: if there is no such camera.
+            ValueError: if the camera does not exist.
             RuntimeError: if no OpenGL backend works.
         """
         size = self.camera_size if size is None else size
@@ -200,7 +200,7 @@ class RobosuiteEnv(EnvBase):
 
     def _make_specs(self, env: Any) -> None:
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
-        self._late: ControlLoop | None = None  # the loop, where it may observe afterwards
+        self._late: ControlLoop | None = None  # the loop, if it can observe afterwards
         if isinstance(self._loop, ControlLoop) and self._loop.looks_back:
             others = self.from_pixels or self.sim_state or self.eef_pose
             self._late = None if others else self._loop
@@ -237,7 +237,7 @@ class RobosuiteEnv(EnvBase):
             self._seed, self._episode = seed, 0
 
     def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        # This runs between control steps of physics, which leave nothing of other code in the caches.
+        # Kept short: it runs between physics steps, which evict everything else from the caches.
         state = [observations[key] for key in self.low_dim_keys]
         measured: dict[str, Any] = {
             keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
@@ -254,15 +254,15 @@ class RobosuiteEnv(EnvBase):
         return measured
 
     def _count(self, success: bool) -> _Flags:
-        """Count a control step; what it means for the episode."""
+        """Count a control step, and return its flags."""
         self._elapsed += 1
         terminated = success and self.terminate_on_success
         out_of_time = self.horizon is not None and self._elapsed >= self.horizon
         return success, terminated, out_of_time and not terminated, terminated or out_of_time
 
     def _tell(self, flags: Sequence[_Flags], measured: Collection[dict[str, Any]]) -> list[TensorDictBase]:
-        """A result per step, of which the last ones tell what was measured."""
-        # Arrays are made tensors and split, instead of one small tensor per entry and step.
+        """Return a result per step; the last ones have observations."""
+        # Whole arrays become tensors and are split, which is faster than a small tensor per entry and step.
         bits = np.array(flags)
         booleans = iter(torch.from_numpy(bits.reshape(-1, 1)).unbind(0))
         rewards = torch.from_numpy(bits[:, :1].astype(np.float32)).unbind(0)
@@ -273,7 +273,7 @@ class RobosuiteEnv(EnvBase):
             for key, value in values.items():
                 nested = isinstance(value, dict)
                 entry[key] = TensorDict(value) if nested else torch.from_numpy(value)
-        # Without the constructor's checks, which take longer than all of the above.
+        # The constructor's checks are skipped, because they take longer than all of the above.
         results = [TensorDict._new_unsafe(entry, batch_size=torch.Size([])) for entry in entries]
         return results if self.device is None else [r.to(self.device) for r in results]
 
@@ -289,12 +289,12 @@ class RobosuiteEnv(EnvBase):
         return result
 
     def control_steps(self, actions: torch.Tensor, keep: int) -> list[TensorDictBase]:
-        """Take up to ``n`` control steps until the episode ends; what each led to.
+        """Take up to ``n`` control steps until the episode ends, and return their results.
 
-        :class:`~warmprior.ChunkStep` executes chunks by it, where no transform and no subclass's ``_step``
-        has to see every step. ``actions`` are ``[n, d_a]``, ``n >= 1``. Only the last ``keep``, at least 1,
-        tell observations; the others reward, ``"success"`` and done flags alone. Observations that are no
-        poses are taken at every step.
+        :class:`~warmprior.ChunkStep` executes chunks with it if no transform and no subclass's ``_step`` must
+        see every step. ``actions`` are ``[n, d_a]``, ``n >= 1``. Only the last ``keep`` results, at least 1,
+        have observations; the others have only reward, ``"success"`` and done flags. Observations other than
+        poses are measured at every step.
         """
         check_whole_numbers(keep=keep)
         rows = actions.detach().cpu().double().unbind(0)
@@ -312,6 +312,6 @@ class RobosuiteEnv(EnvBase):
             if flags[-1][-1]:
                 break
         if self._late is not None:
-            # One more than asked for: see ControlLoop.look_back.
+            # One more than needed, because the first may be wrong (see ControlLoop.look_back).
             measured.extend(map(self._measure, self._late.look_back(states[-keep - 1 :])))
         return self._tell(flags, measured)

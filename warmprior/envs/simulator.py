@@ -1,4 +1,4 @@
-"""What every use of robosuite here shares: a quiet import, isolated seeding and one way to make it."""
+"""Access to robosuite: a quiet import, isolated seeding and one way to build an environment."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _ARM_CONTROLLER = {
 
 @contextlib.contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hold back warnings (not errors): robosuite logs five about optional parts when imported."""
+    """Suppress warnings (not errors), because robosuite logs five about optional parts when imported."""
     before = logging.root.manager.disable
     logging.disable(max(before, logging.WARNING))
     try:
@@ -56,7 +56,7 @@ def _without_warnings() -> Iterator[None]:
 
 
 def import_robosuite() -> ModuleType:
-    """The module ``robosuite``, without its start-up warnings."""
+    """Import ``robosuite`` without its start-up warnings."""
     with _without_warnings():
         return require("robosuite", "sim")
 
@@ -96,7 +96,7 @@ def task_env_args(task: str) -> dict[str, Any]:
         "controller_configs": {"type": "BASIC", "body_parts": {"right": copy.deepcopy(_ARM_CONTROLLER)}},
     }
     if is_mimicgen(spec.env_name):
-        del kwargs["lite_physics"]  # some of its tasks refuse the argument
+        del kwargs["lite_physics"]  # some of MimicGen's tasks reject the argument
     if spec.arms == 2:
         kwargs["env_configuration"] = "opposed"
     return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
@@ -114,7 +114,7 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
             register_mimicgen()
     if name not in robosuite.ALL_ENVIRONMENTS:
         names = ", ".join(sorted(robosuite.ALL_ENVIRONMENTS))
-        raise ValueError(f"robosuite has no {name!r} unless its package is imported first; it has {names}")
+        raise ValueError(f"robosuite has no environment {name!r}: import its package first; it has {names}")
     kwargs = dict(env_args["env_kwargs"])
     kwargs.update(
         has_renderer=False,
@@ -129,9 +129,9 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
 
 
 def check_scene_stays(env: Any) -> None:
-    """Raise ValueError if a simulator moves fixtures at resets, which its state says nothing of.
+    """Raise ValueError if a simulator moves fixtures at resets, which are not part of its state.
 
-    Afterwards its model has the scene, without the grippers' markers, which no episode shows.
+    Afterwards its model holds the scene without the grippers' markers, which no episode shows.
     """
     placed = []
     with isolated_numpy_seed(0):
@@ -144,10 +144,10 @@ def check_scene_stays(env: Any) -> None:
 
 
 def action_limits(env: Any) -> list[float]:
-    """The largest magnitude of each entry of an environment's action.
+    """Return the largest magnitude of each entry of an environment's action.
 
-    Those of absolute targets only say what is worth sampling: of joints their range in radians, of poses two
-    metres and half a turn.
+    For absolute targets it only bounds random samples: joints by their range in radians, poses by two metres
+    and half a turn.
     """
     limits: list[float] = []
     for robot in env.robots:

@@ -12,26 +12,26 @@ from warmprior.checks import check_choice
 #: so a policy is never evaluated on an initial state it was trained on.
 EVALUATION_SEED = 10_000_000
 
-#: Of demonstrations: robomimic's one or six operators, MimicGen's ten human ones, and those made of them.
+#: Styles of demonstrations: robomimic's one or six operators, MimicGen's ten human ones and their variations.
 STYLES = ("ph", "mh", "source", "core")
 
 _ARM_WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 
 
 def low_dim_keys(arms: int) -> tuple[str, ...]:
-    """The observations that make up the state: ``object``, then each arm's pose and gripper."""
+    """Return the observations that make up the state: ``object``, then each arm's pose and gripper."""
     return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_WIDTHS))
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What the library knows about one task.
+    """The facts about a task.
 
     Attributes:
         name: the short name used by robomimic or MimicGen and by this library's options.
         env_name: the robosuite environment.
         arms: the number of Panda arms (1 or 2).
-        horizon_ph: time limit in control steps, but for six-operator data.
+        horizon_ph: time limit in control steps, except for six-operator data.
         horizon_mh: time limit in control steps for six-operator (``mh``) data.
         object_dim: width of the ``object`` observation.
         cameras: the cameras of robomimic's image files, third person first.
@@ -53,7 +53,7 @@ class TaskSpec:
 
     @property
     def low_dim_keys(self) -> tuple[str, ...]:
-        """Observation keys whose concatenation is the state, ``object`` first, then each arm."""
+        """The observation keys whose concatenation is the state, ``object`` first, then each arm."""
         return low_dim_keys(self.arms)
 
     @property
@@ -64,16 +64,16 @@ class TaskSpec:
 
     @property
     def observation_dim(self) -> int:
-        """Width of the concatenated state."""
+        """The width of the concatenated state."""
         return sum(self.low_dim_widths.values())
 
     @property
     def action_dim(self) -> int:
-        """Width of the action, which is a 6-d pose delta and a gripper command per arm."""
+        """The width of the action, which is a 6-d pose delta and a gripper command per arm."""
         return 7 * self.arms
 
     def horizon(self, style: str) -> int:
-        """Time limit in control steps for data of ``style``, one of :data:`STYLES`."""
+        """Return the time limit in control steps for data of a style, one of :data:`STYLES`."""
         return self.horizon_mh if style == "mh" else self.horizon_ph
 
 
@@ -115,7 +115,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 def get_task(name: str) -> TaskSpec:
-    """Look a task up by its short name, a key of :data:`TASKS`; a ``ValueError`` if there is none.
+    """Return a task by its short name, a key of :data:`TASKS`; raise ValueError if there is none.
 
     Examples:
         >>> from warmprior.envs import get_task
@@ -127,5 +127,5 @@ def get_task(name: str) -> TaskSpec:
 
 
 def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
-    """The task of :data:`TASKS` that uses an environment, or ``None``."""
+    """Return the task of :data:`TASKS` that uses an environment, or ``None``."""
     return next((task for task in TASKS.values() if task.env_name == env_args["env_name"]), None)
