@@ -1,4 +1,4 @@
-"""Policies on robots, which do not wait."""
+"""Policies on robots, which do not wait for a computation."""
 
 from warmprior.deploy.executor import AsyncExecutor
 

@@ -1,4 +1,4 @@
-"""One action per control step, while the next chunk is computed in parallel."""
+"""Execution of one action per control step while the next chunk is computed in parallel."""
 
 from __future__ import annotations
 
@@ -41,46 +41,46 @@ from warmprior.transforms.history import HistoryObservation
 
 
 class AsyncExecutor:
-    """Runs a policy beside a control loop: computes the next chunk while this one is executed.
+    """A runner of a policy next to a control loop: it computes the next chunk while this one is executed.
 
     Every ``execute`` control steps a decision begins in a thread, with the observation of that step. Until
-    its chunk is ready the robot continues the old one; the new one takes effect at the position that the
-    robot has reached. The largest delay of the last decisions is what the policy expects next (``("rtc",
-    "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is of this
-    moment, however late a decision is: the executed actions one by one, and what is left of the chunk, which
-    is nothing once it is used up. :class:`~warmprior.InferenceDelay` does the same in simulation: with
+    its chunk is ready, the robot continues the old one; the new chunk takes effect at the position that the
+    robot has reached. The policy is told to expect the largest delay of the last decisions (``("rtc",
+    "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is always
+    current, even if a decision is late: it holds each executed action and the rest of the chunk, which is
+    empty once the chunk is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with
     ``latency`` the actions are equal.
 
     The first step of an episode waits for its chunk. Later, if no action is left, :meth:`act` waits for at
     most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again. Several threads
     can share an executor: their calls take turns.
 
-    Everything else is the policy's own: its normaliser, its stack of observations, and the names and sizes of
-    what it sees. Images of cameras may have any size: they are resized to that of the training, which the
-    encoder then crops in the middle.
+    Normaliser, stack of observations, and the names and sizes of observations are the policy's. Camera images
+    may have any size: they are resized to that of the training, of which the encoder takes the central crop.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, a :class:`~warmprior.lerobot.LeRobotActor`, or any module
             that reads ``"observation"`` (or ``("prior", "observation")``, which includes the last actions),
-            ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``; set to evaluation mode. It
-            is called without batch dimensions.
+            ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``. It is set to evaluation
+            mode, and called without batch dimensions.
         prior: the policy's prior, of which only the lengths matter; the actor's own by default.
         execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
-        delay: expected delay until delays were measured, in control steps, or in seconds with
-            ``control_rate``; one control step by default.
+        delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
+            one control step by default.
         control_rate: control steps per second.
-        window: how many last decisions to take the largest delay of.
+        window: number of last decisions whose largest delay is expected.
         observation_steps: ``To``; that of the actor's network by default, or 2.
-        normalizer: converts raw observations and actions; the actor's own by default. Without one they are in
-            the policy's units, as for ``actor.replace(normalizer=None)``.
-        timeout: seconds to wait for a late chunk once no action is left; ``None`` for as long as it takes.
-        latency: to simulate: chunks are computed in the calling thread and take effect this many steps later.
-        pool: where to compute; by default in one thread, which :meth:`close` ends.
+        normalizer: converts raw observations and actions; the actor's own by default. Without one, they are
+            in the policy's units, as for ``actor.replace(normalizer=None)``.
+        timeout: seconds to wait for a late chunk once no action is left; ``None`` waits without limit.
+        latency: simulated delay: chunks are computed in the calling thread and take effect this many control
+            steps later.
+        pool: executor in which chunks are computed; by default one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
 
     Raises:
-        ValueError: for numbers that do not fit each other, a missing argument that the actor does not
-            provide, or a normaliser without observations or actions.
+        ValueError: if numbers do not fit each other, an argument is missing that the actor does not provide,
+            or the normaliser lacks observations or actions.
 
     Examples:
         >>> import torch
@@ -141,7 +141,7 @@ class AsyncExecutor:
         weights = chain(actor.parameters(), actor.buffers())
         device = getattr(plain, "device", None)  # LeRobot's weights are not among the actor's
         self._device = device or next((value.device for value in weights), torch.device("cpu"))
-        # Guidance refuses delays behind the positions that it guides.
+        # Guidance raises an error for delays longer than its horizon.
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
         self._reach = getattr(guidance, "horizon", None) or length
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
@@ -162,7 +162,7 @@ class AsyncExecutor:
 
     @property
     def delays(self) -> tuple[int, ...]:
-        """Delays of the last decisions in control steps, without first decisions."""
+        """The delays of the last decisions in control steps, except first decisions of episodes."""
         with self._lock:
             return tuple(self._delays)
 
@@ -174,7 +174,7 @@ class AsyncExecutor:
     def reset(self) -> None:
         """Begin another episode.
 
-        A decision under way runs to its end, advances the generator and is discarded.
+        A decision that is being computed is completed, advances the generator and is discarded.
         """
         with self._lock:
             if self._pending is not None:
@@ -182,21 +182,21 @@ class AsyncExecutor:
             self._pending, self._failed = None, False
             self._frames.clear()
             self._history = cold_history([], self.prior.history_length, *self._shape)
-            # The chunk as it is executed from the last decision on, and where it ends.
+            # The chunk as it is executed from the last decision on, and its end.
             self._chunk, self._end, self._executed = self._history["forecast"], 0, 0
 
     def act(self, observation: Tensor | TensorDictBase | Mapping[str, Any]) -> Tensor:
         """Return this control step's action, ``[d_a]`` on the CPU, for a raw observation.
 
-        That is a vector ``[d_o]``, or a dictionary or tensordict with the vector ``"state"`` and the images
-        that the policy sees, under their names, uint8 ``[h, w, 3]`` or ``[3, h, w]``; other entries are
-        ignored. NumPy's arrays do as well.
+        The observation is a vector ``[d_o]``, or a dictionary or tensordict with the vector ``"state"`` and
+        the policy's images under their names, uint8 ``[h, w, 3]`` or ``[3, h, w]``; other entries are
+        ignored. NumPy arrays work too.
 
         Raises:
-            KeyError: if an entry is missing; nothing has changed then.
-            ValueError: if one has another shape or is no image; likewise.
+            KeyError: if an entry is missing; the executor's state is then unchanged.
+            ValueError: if an entry has another shape or is not an image; the state is then unchanged.
             TimeoutError: if no action is left, and the next chunk is not ready in time.
-            RuntimeError: after :meth:`close`.
+            RuntimeError: if the executor is closed.
             Exception: the policy's own error, once no action is left. Until then, and at every further call,
                 the decision is tried again.
         """
@@ -219,29 +219,29 @@ class AsyncExecutor:
 
     @property
     def _first(self) -> bool:
-        """Whether the decision under way is the first of its episode."""
+        """True if the current decision is the first of its episode."""
         return not self._history["steps"]
 
     @property
     def _left(self) -> int:
-        """Actions that are left to execute."""
+        """The number of actions that are left to execute."""
         return self._end - self._executed
 
     def _see(self, observation: Tensor | TensorDictBase | Mapping[str, Any]) -> None:
-        seen = self._observed(observation)
-        self._frames.append(seen)
+        step = self._observed(observation)
+        self._frames.append(step)
         while len(self._frames) < (self._frames.maxlen or 0):
-            self._frames.append(seen)
+            self._frames.append(step)
 
     def _decide(self) -> None:
         """Begin a decision; the rest of the chunk moves to the positions of the new one.
 
-        Whatever fails in it is the decision's error.
+        An error in it becomes the decision's result.
         """
         left = self._left
         if self._executed:
             self._history = caught_up(self._history, self._chunk, torch.tensor([self._executed]))
-            # Less than a whole chunk where the last decision failed.
+            # Fewer than a whole chunk if the last decision failed.
             self._history["forecast_steps"] = torch.tensor([left])
         self._chunk, self._end, self._executed = self._history["forecast"], left, 0
         self._failed = False
@@ -256,14 +256,14 @@ class AsyncExecutor:
                 decision.set_result(self._compute(data))
             else:
                 decision = self._pool.submit(self._compute, data)
-        except Exception as error:  # as a thread would keep it
+        except Exception as error:  # kept as the decision's result, as by a thread
             decision.set_exception(error)
         self._pending = decision
 
     @torch.no_grad()
     def _compute(self, data: TensorDictBase) -> Tensor:
-        """The policy's chunk, in whichever thread."""
-        # Tensors of its own: those of a loop under torch.inference_mode() have no gradients for guidance.
+        """Return the policy's chunk; this may run in another thread."""
+        # Copied, because tensors of a loop under torch.inference_mode() have no gradients for guidance.
         data = data.clone()
         if self._sees_history:
             data = HistoryObservation()(data)
@@ -275,7 +275,7 @@ class AsyncExecutor:
         return chunk.to(self._chunk)
 
     def _collect(self) -> None:
-        """Let the chunk under way take effect, if it is ready."""
+        """Let the computed chunk take effect, if it is ready."""
         if self._pending is None or not self._pending.done():
             return
         try:
@@ -299,8 +299,8 @@ class AsyncExecutor:
         self._end, self._pending = len(chunk), None
 
     def _wait(self) -> None:
-        """Wait for the chunk under way."""
-        assert self._pending is not None, "where no action is left, a decision is under way"
+        """Wait for the chunk that is being computed."""
+        assert self._pending is not None, "a decision has begun if no action is left"
         try:
             self._pending.exception(None if self._first else self.timeout)
         except NotDone as late:
@@ -308,12 +308,12 @@ class AsyncExecutor:
                 f"no action is left after {self._executed} control steps and {self.timeout} s. Hold the "
                 "robot and call again; execute fewer actions, or predict longer chunks"
             ) from late
-        except CancelledError:  # by whoever has the pool
+        except CancelledError:  # the owner of the pool may cancel it
             pass
         self._collect()
 
     def close(self) -> None:
-        """End the thread, after a decision under way; a pool that was given is left as it is."""
+        """End the thread after the current decision; a pool passed as an argument is not closed."""
         self._closed = True
         if (pending := self._pending) is not None:
             pending.cancel()
@@ -330,7 +330,7 @@ class AsyncExecutor:
 
 
 def _steps(delay: float | None, control_rate: float | None) -> int:
-    """A delay in control steps, from seconds where the rate is given."""
+    """Return a delay in control steps, converted from seconds if the rate is given."""
     if delay is None:
         return 1
     if control_rate is None:
@@ -345,11 +345,11 @@ def _steps(delay: float | None, control_rate: float | None) -> int:
 
 
 def _shapes(actor: Any, network: Any, prior: Prior) -> Mapping[str, tuple[int, ...]] | None:
-    """Of what a policy sees in one step, by name; ``None`` if that is not known."""
+    """Return the shapes of a policy's observation at one step, by name, or ``None`` if unknown."""
     if (shapes := getattr(actor, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
         return shapes
     encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
-    if encoder is not None or network.encodes:  # by a user's own encoder
+    if encoder is not None or network.encodes:  # a user's own encoder may have no shapes
         return None if encoder is None else encoder.shapes
     width = network.observation_dim
     if keys.CONDITIONED in actor.in_keys:

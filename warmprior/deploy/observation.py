@@ -1,4 +1,4 @@
-"""What a robot's drivers return, as its policy sees it."""
+"""Conversion of a robot's raw observations to those of its policy."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from warmprior.modules.normalize import Normalizer
 
 
 class RobotObservation:
-    """Turns raw observations into those of a policy: a copy of what it sees, in its units and sizes.
+    """A converter of raw observations to those of a policy: copies in its units and sizes.
 
     Args:
-        shapes: of what the policy sees, by name: vectors ``(d,)`` and images ``(3, h, w)``; ``None`` if that
-            is not known, and observations are taken as they are.
-        normalizer: of vectors.
+        shapes: shapes of the policy's observations by name: vectors ``(d,)`` and images ``(3, h, w)``;
+            ``None`` if they are unknown, and observations are only copied.
+        normalizer: normaliser of vectors.
     """
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]] | None, normalizer: Normalizer | None) -> None:
         self.shapes, self.normalizer = shapes, normalizer
-        # A policy that sees one vector takes it without its name.
+        # A policy with a single vector takes it without a name.
         self._vector = shapes is not None and [len(shape) for shape in shapes.values()] == [1]
 
     def __call__(self, observation: Any) -> Tensor | TensorDictBase:
-        """The observation of one step, ``[d]`` or a tensordict ``[]``.
+        """Return the observation of one step, ``[d]`` or a tensordict ``[]``.
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if one is no array, a vector of another width, or no image.
+            ValueError: if an entry is not an array, has another width, or should be an image and is not.
         """
-        seen = self._entries(observation)
+        converted = self._entries(observation)
         if self.normalizer is None:
-            return seen
-        return self.normalizer.normalize(TensorDict({keys.OBSERVATION: seen}))[keys.OBSERVATION]
+            return converted
+        return self.normalizer.normalize(TensorDict({keys.OBSERVATION: converted}))[keys.OBSERVATION]
 
     def _entries(self, observation: Any) -> Tensor | TensorDictBase:
         named = isinstance(observation, Mapping | TensorDictBase)
@@ -51,39 +51,39 @@ class RobotObservation:
         if not named:
             if not self._vector:
                 raise ValueError(
-                    f"the observation is {type(observation).__name__}, and the policy sees the entries "
+                    f"the observation is {type(observation).__name__}, but the policy needs the entries "
                     f"{list(self.shapes)}"
                 )
             observation = dict.fromkeys(self.shapes, observation)
         check_keys(
             observation, self.shapes, "the policy", f"; there are {sorted(map(str, observation.keys()))}"
         )
-        seen = {name: _fitted(name, observation[name], shape) for name, shape in self.shapes.items()}
-        return next(iter(seen.values())) if self._vector else TensorDict(seen)
+        entries = {name: _fitted(name, observation[name], shape) for name, shape in self.shapes.items()}
+        return next(iter(entries.values())) if self._vector else TensorDict(entries)
 
 
 def _copied(name: str, value: Any) -> Tensor:
-    """A copy on the CPU: drivers may reuse the memory for the next observation."""
+    """Copy to the CPU, because drivers may reuse the memory for the next observation."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     try:
-        # Of NumPy, since PyTorch takes no array that was turned over, as from BGR to RGB.
+        # Copied by NumPy, since PyTorch takes no array with negative strides, as from BGR to RGB.
         return torch.from_numpy(np.array(value, order="C"))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name!r} is no array of numbers, but {type(value).__name__}") from error
+        raise ValueError(f"{name!r} is not an array of numbers, but {type(value).__name__}") from error
 
 
 def _fitted(name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-    """A vector as it is; an image channels first and resized, as LeRobot's images are for ``warm_flow``."""
-    found = _copied(name, value)
+    """Check a vector; put an image's channels first and resize it, as the LeRobot plugin does."""
+    array = _copied(name, value)
     if len(shape) != 3:
-        check_shape(name, found, shape)
-        return found
-    image = found if found.ndim != 3 or len(found) == 3 else found.movedim(-1, 0)
+        check_shape(name, array, shape)
+        return array
+    image = array if array.ndim != 3 or len(array) == 3 else array.movedim(-1, 0)
     if image.dtype != torch.uint8 or image.ndim != 3 or len(image) != 3 or not image.numel():
         raise ValueError(
-            f"{name!r} is no image: it has shape {list(found.shape)} of {found.dtype}, and a camera gives "
-            "uint8 [h, w, 3] or [3, h, w]"
+            f"{name!r} is not an image: it has shape {list(array.shape)} of {array.dtype}, but a camera "
+            "gives uint8 [h, w, 3] or [3, h, w]"
         )
     if image.shape == shape:
         return image
