@@ -55,7 +55,7 @@ def test_networks_that_do_not_fit():
         DSRLNALoss(actor, noise, noise, decoder)
     with pytest.raises(ValueError, match=r"noise_qvalue_network must read .*delta"):
         DSRLNALoss(actor, chunk, chunk, decoder)
-    with pytest.raises(ValueError, match=r"half side 1.5, and the decoder's 0.5"):
+    with pytest.raises(ValueError, match=r"half side 1.5.*decoder's 0.5"):
         DSRLNALoss(make_prior_space_actor(*sizes, delta=1.5), chunk, noise, decoder)
     with pytest.raises(ValueError, match=r"the actor writes .*shift.*, but the decoder reads .*delta"):
         parameters = {"loc": "delta_loc", "scale": "delta_scale"}

@@ -109,5 +109,5 @@ def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
 
 
 def test_a_policy_of_vectors_has_nothing_to_encode():
-    with pytest.raises(ValueError, match="VelocityMLP takes observations as they are"):
+    with pytest.raises(ValueError, match="VelocityMLP has no encoder"):
         EncodeObservation(make_actor())

@@ -26,37 +26,39 @@ from warmprior.training.checkpoint import named, restore_optimizer, select, snap
 
 @dataclass(frozen=True)
 class PriorSpaceConfig:
-    """The recipe; the defaults are DSRL's for Lift, Can and Square, around a WarmPrior mean.
+    """The recipe of prior-space reinforcement learning.
+
+    The defaults are DSRL's for Lift, Can and Square, around a WarmPrior mean.
 
     Attributes:
         algorithm: ``"dsrl-na"`` or ``"dsrl-sac"``.
-        environment_steps: control steps to collect, those of the warm-up included.
-        warmup_steps: control steps with residuals drawn from the prior and clipped to the box, before any
-            update.
+        environment_steps: control steps to collect, including the warm-up.
+        warmup_steps: control steps before any update, with residuals drawn from the prior and clipped to the
+            box.
         delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.
-        distillation: where the noise critic learns, see ResidualSampler, DSRL-NA only; by default in the
-            clipped source around a mean, and in the whole source around zero.
+        distillation: distribution of residuals on which the noise critic is trained, see ResidualSampler,
+            DSRL-NA only; by default the clipped source around a mean, and the whole source around zero.
         batch_size: transitions per update.
-        learning_rate: of actor, critics and temperature.
-        tau: of the target critics' averaging.
+        learning_rate: learning rate of actor, critics and temperature.
+        tau: rate of the target critics' averaging.
         gamma: discount per decision.
         hidden_dim: width of actor and critics.
-        num_layers: their number of hidden layers.
-        backup_entropy: whether the targets of DSRL-NA's critic include the entropy; those of SAC always do.
-        alpha_init: initial temperature, DSRL's 1. If success ends the episode, take less than ``reward_offset
-            * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth more than success
-            until the temperature has fallen.
-        target_entropy: in units of the box.
-        reward_offset: subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
+        num_layers: number of hidden layers of actor and critics.
+        backup_entropy: include the entropy in the targets of DSRL-NA's critic; those of SAC always do.
+        alpha_init: initial temperature, 1 in DSRL. If success ends the episode, choose less than
+            ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
+            more than success until the temperature has fallen.
+        target_entropy: target of the entropy, in units of the box.
+        reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
         evaluate_every: control steps between evaluations (and saves).
         evaluation_episodes: episodes per evaluation, greedy and stochastic each.
-        seed: of everything random.
+        seed: seed of all random draws.
 
     Raises:
-        ValueError: for a number out of its range, naming it.
+        ValueError: if a number is out of range.
 
     Examples:
         >>> from warmprior.rl import PriorSpaceConfig
@@ -111,16 +113,16 @@ class PriorSpaceConfig:
             )
 
     def box(self, actor: WarmPriorActor) -> float:
-        """``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
+        """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
         if self.delta is not None:
             return self.delta
         return 0.5 if has_anchor(actor) else 1.5
 
 
 class WarmUpSwitch(TensorDictModuleBase):
-    """Acts by ``warmup``, and by ``policy`` once ``learning`` is set.
+    """A policy that acts by ``warmup``, and by ``policy`` once ``learning`` is True.
 
-    That is a buffer, bool ``[]``, which collectors receive with the weights.
+    The flag ``learning`` is a buffer, bool ``[]``, which collectors receive with the weights.
     """
 
     def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:
@@ -139,16 +141,16 @@ class WarmUpSwitch(TensorDictModuleBase):
 class PriorSpaceAgent:
     """An agent around a copy of a frozen policy, its critics, and one update of them.
 
-    Initial weights follow from PyTorch's global generator. A ``ValueError`` if the recipe does not suit the
-    policy. ``policy`` is the agent followed by the decoder, ``warmup`` residuals from the prior in the
-    agent's place.
+    PyTorch's global generator draws the initial weights. Raises ValueError if the recipe does not fit the
+    policy. ``policy`` is the agent followed by the decoder; in ``warmup`` residuals from the prior replace
+    the agent.
     """
 
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
         self.config = config
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
-        # By default draws around a mean stay in the box, and draws around zero do not.
+        # By default, draws around a mean are clipped to the box, and draws around zero are not.
         drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
@@ -165,7 +167,7 @@ class PriorSpaceAgent:
             **sizes,
             delta=self.decoder.delta,
             in_keys=self.state_keys,
-            # DSRL-NA changes units by itself, TorchRL's SAC does not.
+            # DSRL-NA converts log-probabilities to units of the box itself, TorchRL's SAC does not.
             distribution_class=BoxTanhNormal if config.algorithm == "dsrl-sac" else TanhNormal,
         ).to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
@@ -203,10 +205,10 @@ class PriorSpaceAgent:
         )
 
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
-        """The updates for one vector step of the environment, each on its own batch from the agent's device.
+        """Make the updates for one vector step of the environment, each on its own batch.
 
-        Of the last one the critic's loss ``"q"`` and the temperature ``"alpha"``. A ``FloatingPointError``
-        names a loss that is NaN or infinite before it changes anything.
+        Returns the critic's loss ``"q"`` and the temperature ``"alpha"`` of the last update. Raises
+        FloatingPointError if a loss is NaN or infinite, before it changes anything.
         """
         values: dict[str, Tensor] = {}
         schedule: Iterable[Callable[[TensorDictBase], TensorDict]] = [self.loss] * self.config.updates
@@ -225,12 +227,12 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        # Without the frozen policy; and of the buffers only those of the target critics.
+        # Without the frozen policy, and without buffers other than the target critics'.
         targets = {k: v for k, v in self.loss.named_buffers() if k.split(".")[0].endswith("_params")}
         return {k: v for k, v in self.loss.named_parameters() if v.requires_grad} | targets
 
     def state(self) -> dict[str, Tensor]:
-        """All that learning has changed, by name, checked: a finite loss may have an infinite gradient."""
+        """Return all learned tensors, by name, checked: a finite loss may have an infinite gradient."""
         tensors = {
             **named("loss", self._parameters()),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
@@ -239,7 +241,7 @@ class PriorSpaceAgent:
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go back to what :meth:`state` gave."""
+        """Restore the tensors of :meth:`state`."""
         saved = select("loss", tensors)
         with torch.no_grad():
             for name, value in self._parameters().items():

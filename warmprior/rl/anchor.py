@@ -1,4 +1,4 @@
-"""The environment's side of prior-space reinforcement learning: the centre of the agent's box."""
+"""The centre of the agent's box, which environments write in prior-space reinforcement learning."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_
 
 
 def has_anchor(actor: Any) -> bool:
-    """Whether a policy's source has a moving centre, around which an agent can search.
+    """Return True if a policy's source has a moving centre, around which an agent can search.
 
-    It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
-    agents search around zero, as in DSRL.
+    It has one if the policy has a start point, or its prior's mean is warm once the history is full.
+    Otherwise agents search around zero, as in DSRL.
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
@@ -32,7 +32,7 @@ def has_anchor(actor: Any) -> bool:
         [False, True]
     """
     prior, width = actor.prior, getattr(actor.network, "action_dim", None) or 1
-    # Without mean() it overrides distribution(), and its source moves.
+    # A prior without mean() overrides distribution(), and its source moves.
     if actor.start is not None or type(prior).mean is Prior.mean:
         return True
     chunk, target = (torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length))
@@ -42,9 +42,9 @@ def has_anchor(actor: Any) -> bool:
 
 
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The centre of the source at decisions, ``[*B, P, d_a]``, and where it is known, bool ``[*B, P, 1]``.
+    """Return the centre of the source, ``[*B, P, d_a]``, and a mask of valid positions, bool ``[*B, P, 1]``.
 
-    Of histories ``[*B]`` and what the policy's network sees, ``[*B, To, d_o]``.
+    The histories are ``[*B]``, and the observations of the policy's network ``[*B, To, d_o]``.
     """
     if actor.start is not None:
         centre = actor.start.centre(history, observation)
@@ -54,47 +54,46 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
 
 
 def residual_sigma(actor: Any) -> float:
-    """Typical deviation of a policy's source from the centre of the search; 1 around zero."""
+    """Return the typical deviation of a policy's source from the centre of the search; 1 around zero."""
     if not has_anchor(actor):
         return 1.0
     if actor.start is not None:
         return actor.start.noise_share
-    # A learned source, whose sigma is a factor, has a scale of its own.
+    # The sigma of a learned source multiplies its own scale.
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
 class PriorAnchor(EnvTransform):
-    r"""Writes the anchor, ``[*B, P, d_a]``, around which agents act: the mean, and noise where it is cold.
+    r"""A transform that writes the anchor of agents, ``[*B, P, d_a]``: the mean, and noise where it is cold.
 
     .. math::
         c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
         c_\tau = \varepsilon_\tau \text{ or } 0 \;\; (\tau \in C), \qquad a_0 = c + \Delta.
 
-    The first chunk of an episode has no mean, and neither has the second half of a preview. A small box
-    around zero would confine these positions to the middle of the source that the policy was trained on; a
-    box around a draw of that source does not. This transform makes the draw before the agent acts, so that
-    the agent sees the noise, the decision process stays Markov (for WP-Past if whole chunks are executed, see
-    :func:`~warmprior.make_prior_space_actor`) and the decoder deterministic. For a policy with a
+    The first chunk of an episode and the second half of a preview have no mean. A small box around zero would
+    confine these positions to the middle of the source that the policy was trained on; a box around a draw of
+    that source does not. This transform draws before the agent acts, so that the agent sees the noise, the
+    decision process stays Markov (for WP-Past if whole chunks are executed, see
+    :func:`~warmprior.make_prior_space_actor`), and the decoder is deterministic. For a policy with a
     :class:`~warmprior.StartPoint` the mean is that of the start point.
 
-    Append it after :class:`ActionHistory`, inside or outside of batched environments.
+    Append it after :class:`ActionHistory`, inside or outside batched environments.
 
     .. note::
         ``env.set_seed`` seeds PyTorch's global generator only in the workers of a ``ParallelEnv`` (not with
         ``use_buffers=False``) and of a ``MultiCollector``: in your own process call ``torch.manual_seed``.
-        Workers without a seed, or with the same one, draw the same noise: append the transform outside of
-        them.
+        Workers without a seed, or with the same one, draw the same noise: append the transform outside them.
 
     Args:
-        actor: the policy. A learned prior is copied as it is now, and the copy moves with the environment.
-        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
-            has an anchor (:func:`~warmprior.has_anchor`), and zero otherwise, which gives vanilla DSRL:
+        actor: the policy. A learned prior is copied, and the copy moves with the environment.
+        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` writes zero. By default noise if the
+            policy has an anchor (:func:`~warmprior.has_anchor`), and zero otherwise, which is vanilla DSRL:
             :math:`a_0 = \Delta`.
 
     Raises:
-        ValueError: for an unknown ``cold``, or if the environment's history has other lengths than the
-            policy.
-        KeyError: if :class:`ActionHistory` does not come before.
+        ValueError: if ``cold`` is unknown, or the lengths of the environment's history differ from the
+            policy's.
+        KeyError: if :class:`ActionHistory` does not precede it.
 
     Examples:
         >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -130,15 +129,15 @@ class PriorAnchor(EnvTransform):
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
         if self.cold == "noise":
-            # On the CPU, so that a seed gives the same noise on every device.
+            # Drawn on the CPU, so that a seed gives the same noise on every device.
             cold = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
         else:
             cold = torch.zeros_like(forecast)
         anchor = cold
         if self.moves:
             with torch.no_grad():
-                mean, known = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
-            anchor = torch.where(known, mean, cold)
+                mean, valid = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
+            anchor = torch.where(valid, mean, cold)
         return next_tensordict.set(keys.ANCHOR, anchor)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""From the agent's residual to the executed chunk, through a frozen policy."""
+"""A decoder from the agent's residual to the executed chunk, through a frozen policy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from warmprior.transforms.inner_step import EnvTransform
 
 
 class PriorDecoder(TensorDictModuleBase):
-    r"""The frozen policy as a decoder: ``(observation, anchor, delta) -> (noise, chunk)``.
+    r"""A decoder around a frozen policy: ``(observation, anchor, delta) -> (noise, chunk)``.
 
     An agent acts in the policy's source space through a bounded residual around an anchor,
 
@@ -31,21 +31,21 @@ class PriorDecoder(TensorDictModuleBase):
     and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
     :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
-    Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
+    Place it after the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
     :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy, whose parameters
-    take no gradients, and which stays in evaluation mode. Draw the weights of an agent before you put it in
-    front: ``apply`` and ``reset_parameters_recursive`` of the sequence reach the policy too.
+    require no gradients, and which stays in evaluation mode. Initialise an agent before you combine the two:
+    ``apply`` and ``reset_parameters_recursive`` of the sequence reach the policy too.
 
     Args:
-        actor: the policy; copied. Or an object with the same parts, such as
+        actor: the policy, which is copied, or an object with the same parts, such as
             :class:`~warmprior.lerobot.LeRobotActor`.
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` alone or is
-            guided, or ``nfe`` does not suit it.
+        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` only or is
+            guided, or ``nfe`` does not fit it.
         KeyError: (when called) if an input key is missing.
 
     Examples:
@@ -71,7 +71,7 @@ class PriorDecoder(TensorDictModuleBase):
             )
         if actor.ode.guidance is not None:
             raise ValueError(
-                "the agent's residual alone must decide the chunk: take actor.replace(guidance=None)"
+                "the agent's residual alone must decide the chunk: use actor.replace(guidance=None)"
             )
         self.delta = float(delta)
         self.ode = copy.deepcopy(actor.ode)
@@ -96,7 +96,7 @@ class PriorDecoder(TensorDictModuleBase):
 
     @property
     def action_dim(self) -> int | None:
-        """``d_a``, or ``None`` if the network does not say."""
+        """The number ``d_a``, or ``None`` if the network does not have it."""
         return getattr(self.ode.network, "action_dim", None)
 
     @dispatch(auto_batch_size=False)
@@ -116,11 +116,11 @@ class PriorDecoder(TensorDictModuleBase):
         return tensordict.set(noise_key, noise).set(chunk_key, chunk)
 
     def check_env(self, env: EnvBase) -> None:
-        """Compare the policy's chunks with those that an environment takes: length and width.
+        """Check that the policy's chunks have the length and width that an environment takes.
 
         Raises:
             KeyError: if the environment takes no chunk.
-            ValueError: naming what differs.
+            ValueError: if the length or width differs.
         """
         actions = env.full_action_spec
         if keys.CHUNK not in actions.keys(True, True):
@@ -133,18 +133,18 @@ class PriorDecoder(TensorDictModuleBase):
         check_shape("the chunk that the environment takes", actions[keys.CHUNK], expected)
 
     def train(self, mode: bool = True) -> PriorDecoder:
-        """Stays in evaluation mode."""
+        """Stay in evaluation mode."""
         return super().train(False)
 
 
 class PriorSpace(EnvTransform):
-    r"""Makes the residual the environment's action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
+    r"""A transform with the residual as action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
 
-    The other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
+    It is the other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
     environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
     but the source is under ``("next", "decoded", "noise")`` and the chunk under ``("next", "decoded",
-    "chunk")``: TorchRL drops what an inverse transform writes, so they are part of the next state, and under
-    their usual names they would be mistaken for those of the next step.
+    "chunk")``: TorchRL drops the entries that an inverse transform writes, so these are part of the next
+    state, where their usual names would mean the next step's.
 
     Append it last, after :class:`~warmprior.PriorAnchor`, and outside batched environments: inside, every
     worker would hold a copy of the network.
@@ -153,8 +153,8 @@ class PriorSpace(EnvTransform):
         decoder: the frozen policy.
 
     Raises:
-        KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
-        ValueError: if the environment's chunks are not the policy's, see :meth:`PriorDecoder.check_env`.
+        KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not precede it.
+        ValueError: if the environment's chunks do not fit the policy, see :meth:`PriorDecoder.check_env`.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -202,7 +202,7 @@ class PriorSpace(EnvTransform):
         actions = input_spec["full_action_spec"]
         leaf, delta = actions[keys.CHUNK], self.decoder.delta
         actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device)
-        # With its branch, which would count as an action when it is empty.
+        # The whole branch is removed, because an empty one would count as an action.
         del actions[keys.CHUNK[0]]
         return input_spec
 
@@ -218,25 +218,26 @@ ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
 
 
 class ResidualSampler(TensorDictModuleBase):
-    r"""Draws residuals without an agent, for the warm-up and for distilling the noise critic.
+    r"""A sampler of residuals without an agent, for the warm-up and for distilling the noise critic.
 
     ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
-    ``"clipped"`` clips it to :math:`[-\delta, \delta]`, ``"truncated"`` draws it again until it lies there,
-    and ``"uniform"`` draws from :math:`U[-\delta, \delta]`.
-    :math:`\delta` is the decoder's, :math:`\sigma` the typical deviation of the source from the centre of the
-    search: the prior's ``sigma`` around its mean, the start point's share of noise, or 1 around zero.
+    ``"clipped"`` clips it to :math:`[-\delta, \delta]`, ``"truncated"`` draws again until it is inside, and
+    ``"uniform"`` draws from :math:`U[-\delta, \delta]`. Here :math:`\delta` is the decoder's, and
+    :math:`\sigma` the typical deviation of the source from the centre of the search: the prior's ``sigma``
+    around its mean, the start point's share of noise, or 1 around zero.
 
     ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
     (the environment's own random actions would be random *chunks* there).
 
     Args:
         decoder: the frozen policy.
-        distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
-            noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
+        distribution: one of the names above. By default ``"clipped"`` around a mean (``"uniform"`` if the
+            prior has no noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"``
+            around zero.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:
-        ValueError: for an unknown distribution, or another than ``"uniform"`` for a prior without noise.
+        ValueError: if the distribution is unknown, or not ``"uniform"`` for a prior without noise.
         KeyError: (when called) if the anchor is missing.
 
     Examples:
@@ -264,7 +265,7 @@ class ResidualSampler(TensorDictModuleBase):
             distribution = "normal"
         check_choice("distribution", distribution, get_args(ResidualDistribution))
         if distribution != "uniform" and sigma == 0:
-            raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
+            raise ValueError(f"a prior without noise needs 'uniform', got the distribution {distribution!r}")
         self.distribution = distribution
         self.sigma = sigma
         self.delta = decoder.delta

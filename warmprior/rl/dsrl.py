@@ -33,7 +33,7 @@ from warmprior.rl.networks import BoxTanhNormal
 type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2
-"""Of each kind, of whose values the smaller counts."""
+"""The number of critics of each kind; the smaller of their values is used."""
 
 ELSEWHERE = (
     ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
@@ -42,7 +42,9 @@ ELSEWHERE = (
 
 
 class DSRLNALoss(LossModule):
-    r"""Noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_), around any anchor.
+    r"""The loss of noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_).
+
+    It works around any anchor.
 
     Many sources decode to the same chunk, so an action critic :math:`Q^A(s, a)` learns about the *chunk*, by
     temporal differences on executed chunks. A noise critic :math:`Q^W(s, \Delta)` is distilled from it
@@ -58,10 +60,10 @@ class DSRLNALoss(LossModule):
         L_\pi &= \alpha \log \pi(\Delta | s) - \min_i Q^W_i(s, \Delta), \qquad
         L_\alpha = -\log \alpha \, (\log \pi + \mathcal{H})
 
-    with stopped gradients where SAC has them; batch means throughout. Log-probabilities count in units of the
-    box, :math:`\Delta / \delta \in [-1, 1]`, as in the official implementation, and time-outs count as
-    terminations, as there. The defaults are the official ones but for the discount. The official schedule
-    takes several updates per step and then distils on batches of its own:
+    with stopped gradients where SAC has them, and batch means throughout. As in the official implementation,
+    log-probabilities are in units of the box, :math:`\Delta / \delta \in [-1, 1]`, and time-outs are
+    terminations. The defaults are the official ones, except the discount. The official schedule makes several
+    updates per step and then distils on separate batches:
 
     .. code-block:: python
 
@@ -80,32 +82,32 @@ class DSRLNALoss(LossModule):
         qvalue_network: :math:`Q^A`, which reads ``keys.CHUNK`` (all ``P`` actions, see
             :func:`~warmprior.make_prior_space_critic`); one module, of which two copies are initialised, or a
             list.
-        noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; the same.
+        noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; also one module or a list.
         decoder: the frozen policy. It is in the loss's ``state_dict()`` and moves with ``loss.to(device)``;
             no gradient and no target update reaches it.
-        backup_entropy: whether targets include the entropy.
+        backup_entropy: True includes the entropy in the targets.
         discount: ``"step"`` discounts by :math:`\gamma^k` for ``k`` executed control steps, with the
-            ``gamma`` given to :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma` whatever ``k``,
-            as the official implementation does (with undiscounted rewards inside chunks).
+            ``gamma`` of :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma` for any ``k``, as in
+            the official implementation (with undiscounted rewards inside chunks).
         noise_critic_steps: distillation steps per round of :meth:`schedule`.
         distillation: :math:`q`, see :class:`~warmprior.ResidualSampler`. By default ``"normal"`` around zero,
             the official one, and ``"clipped"`` around a mean.
         alpha_init: initial temperature.
-        target_entropy: :math:`\mathcal{H}`, of the residual in units of the box.
+        target_entropy: :math:`\mathcal{H}`, target of the residual's entropy in units of the box.
 
     .. note::
-        Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (in data from
-        :class:`~warmprior.PriorSpace` ``("next", "decoded", "chunk")``); under ``"next"`` ``reward``,
+        The keys, which :meth:`set_keys` renames, are ``chunk``, the decoded chunk of the transition (in data
+        from :class:`~warmprior.PriorSpace` ``("next", "decoded", "chunk")``); under ``"next"`` ``reward``,
         ``done`` and ``executed``; ``priority``, where the TD error of each row is written;
-        ``priority_weight``; ``state_action_value``, the critics' output. ``loss.in_keys`` lists all that it
-        reads: ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
+        ``priority_weight``; and ``state_action_value``, the critics' output. ``loss.in_keys`` lists all keys
+        that the loss reads: ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
 
     Raises:
-        TypeError: if the actor gives no distribution.
-        ValueError: for an unknown option or a network that does not fit the decoder; (when called) if a
-            critic gives several values.
+        TypeError: if the actor has no distribution.
+        ValueError: if an option is unknown or a network does not fit the decoder; (when called) if a critic
+            returns several values.
         KeyError: (when called) if the batch lacks a key.
-        FloatingPointError: (when called) if a loss is NaN or infinite, naming it.
+        FloatingPointError: (when called) if a loss is NaN or infinite.
 
     Examples:
         >>> from warmprior import DSRLNALoss, PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
@@ -123,7 +125,7 @@ class DSRLNALoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Configurable tensordict keys, see the class docstring."""
+        """The configurable tensordict keys, see the class docstring."""
 
         chunk: NestedKey = keys.CHUNK
         reward: NestedKey = "reward"
@@ -203,12 +205,12 @@ class DSRLNALoss(LossModule):
         return self._states(self.decoder, self.qvalue_network, self.noise_qvalue_network)
 
     def _set_in_keys(self) -> None:
-        """TorchRL calls it from :meth:`set_keys`."""
+        """Set ``in_keys``, when TorchRL calls it from :meth:`set_keys`."""
         needed = [*self._reinforcement_keys(), *self._distillation_keys()]
         self.in_keys = list(dict.fromkeys(unravel_key(key) for key in needed))
 
     def _states(self, *modules: TensorDictModuleBase) -> list[NestedKey]:
-        """The keys that the modules read, without actions."""
+        """Return the keys that the modules read, without actions."""
         actions = {keys.DELTA, keys.CHUNK}
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
@@ -222,23 +224,23 @@ class DSRLNALoss(LossModule):
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """All four losses on one batch of transitions ``[N]``, scalars.
+        """Return all four losses on one batch of transitions ``[N]``, as scalars.
 
-        And detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
+        The result also has detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
         """
         return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
     def schedule(self, updates: int) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
-        """The official order: the first three losses ``updates`` times, then the distillation.
+        """Yield losses in the official order: the first three ``updates`` times, then the distillation.
 
-        The methods to call, each on a batch of its own. ``updates`` is the official ``utd``: updates per
-        vector step, 20 for four environments.
+        They are methods, to be called on a separate batch each. ``updates`` is the official ``utd``: updates
+        per vector step, 20 for four environments.
         """
         check_whole_numbers(updates=updates)
         return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The losses of actor, temperature and action critic on transitions ``[N]``; writes the TD errors."""
+        """Return the losses of actor, temperature and action critic on transitions; write the TD errors."""
         check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()
@@ -247,7 +249,7 @@ class DSRLNALoss(LossModule):
 
         state = tensordict.select(*self._states(self.actor_network, self.noise_qvalue_network))
         delta, log_prob = self._act(state)
-        # Gradients reach the residual, not the critic.
+        # Detached, so that gradients reach the residual but not the critic.
         frozen = self.noise_qvalue_network_params.detach()
         value = self._vmap_noise_qvalue(state.set(keys.DELTA, delta), frozen)
         loss_actor = alpha * log_prob - self._values(value).amin(0)
@@ -272,7 +274,7 @@ class DSRLNALoss(LossModule):
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of the noise critic against the action critic, at any states ``[N]``."""
+        """Return the loss of the noise critic against the action critic, at any states ``[N]``."""
         check_keys(tensordict, self._distillation_keys(), type(self).__name__)
         weights = self._maybe_get_priority_weight(tensordict)
         with torch.no_grad():
@@ -290,14 +292,14 @@ class DSRLNALoss(LossModule):
         reward = after.get(k.reward)
         data = TensorDict({}, batch_size=after.batch_size)
         data.set(("next", e.reward), reward)
-        for flag in (e.done, e.terminated):  # as in the official implementation, a time-out ends it all
+        for flag in (e.done, e.terminated):  # time-outs are terminations, as in the official implementation
             data.set(("next", flag), after.get(k.done))
         if self.discount == "step":
             data.set(e.steps_to_next_obs, after.get(k.executed))
         return estimator.value_estimate(data, next_value=value.view_as(reward)).squeeze(-1)
 
     def _act(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """A residual and its log-probability in units of the box."""
+        """Return a residual and its log-probability in units of the box."""
         with (
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
@@ -317,8 +319,8 @@ class DSRLNALoss(LossModule):
         key = self.tensor_keys.state_action_value
         values = data.get(key, None)
         if values is None or values.shape[-1:] != (1,):
-            found = "none" if values is None else f"the shape {tuple(values.shape)}"
-            raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {found}")
+            shape = "none" if values is None else f"the shape {tuple(values.shape)}"
+            raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {shape}")
         return values.squeeze(-1)
 
     def _finish(
@@ -335,7 +337,7 @@ class DSRLNALoss(LossModule):
 def _check_networks(
     actor: ProbabilisticTensorDictSequential, chunk_critic: Any, noise_critic: Any, decoder: PriorDecoder
 ) -> None:
-    """Check that the networks read and write the decoder's keys; an error names what does not."""
+    """Raise an error unless the networks read and write the decoder's keys."""
     if not isinstance(actor, ProbabilisticTensorDictSequential):
         raise TypeError(
             f"the actor must be the ProbabilisticActor alone, without a decoder behind it, got "
@@ -349,7 +351,7 @@ def _check_networks(
     high = getattr(box, "high", None)
     if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
         raise ValueError(
-            f"the actor's box has the half side {float(high.max())}, and the decoder's {decoder.delta}: "
+            f"the actor's box has the half side {float(high.max())}, but the decoder's {decoder.delta}: "
             "build the actor with delta=decoder.delta"
         )
     for name, critic, key in (

@@ -1,4 +1,4 @@
-"""Actor and critics of an agent that acts in source space."""
+"""The actor and critics of an agent that acts in source space."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class BoxTanhNormal(TanhNormal):
 
     For :math:`\Delta \in [-\delta, \delta]^n` they are those of :math:`\Delta / \delta \in [-1, 1]^n`, larger
     by :math:`n \log \delta`. With it TorchRL's own losses measure entropy as DSRL and
-    :class:`~warmprior.DSRLNALoss` do, whatever the box: ``make_prior_space_actor(...,
+    :class:`~warmprior.DSRLNALoss` do, for any box: ``make_prior_space_actor(...,
     distribution_class=BoxTanhNormal)``, with ``SACLoss(..., target_entropy=0.0)`` as in DSRL.
 
     Args:
-        loc: as for the parent.
-        scale: as for the parent.
-        kwargs (Any): as for the parent, ``low`` and ``high`` among them.
+        loc: see the parent class.
+        scale: see the parent class.
+        kwargs (Any): options of the parent class, including ``low`` and ``high``.
 
     Examples:
         >>> import torch
@@ -44,16 +44,16 @@ class BoxTanhNormal(TanhNormal):
         return half.log().expand(self.event_shape).sum()
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """The log-density of ``value`` in units of the box."""
+        """Return the log-density of ``value`` in units of the box."""
         return super().log_prob(value) + self._change_of_units()
 
     def rsample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """A draw with pathwise gradients and its log-density in units of the box."""
+        """Draw a value with pathwise gradients; return it and its log-density in units of the box."""
         sample, log_prob = super().rsample_and_log_prob(sample_shape)
         return sample, log_prob + self._change_of_units()
 
     def sample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """A draw without pathwise gradients and its log-density in units of the box."""
+        """Draw a value without pathwise gradients; return it and its log-density in units of the box."""
         sample, log_prob = super().sample_and_log_prob(sample_shape)
         return sample, log_prob + self._change_of_units()
 
@@ -62,7 +62,7 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class _Trunk(nn.Module):
-    """``num_layers`` times Linear, LayerNorm and Tanh, then linear, on flattened and concatenated inputs."""
+    """A network of ``num_layers`` times Linear, LayerNorm and Tanh, then Linear, on concatenated inputs."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class _Trunk(nn.Module):
 
 
 class _ActorHead(nn.Module):
-    """Location and scale of the residual before the squashing, each ``[*B, P, d_a]``."""
+    """A head with the residual's location and scale before squashing, each ``[*B, P, d_a]``."""
 
     def __init__(self, trunk: _Trunk, shape: tuple[int, int]) -> None:
         super().__init__()
@@ -132,9 +132,9 @@ def make_prior_space_actor(
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
     distribution_class: type[TanhNormal] = TanhNormal,
 ) -> ProbabilisticActor:
-    r"""A squashed Gaussian over residuals, :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
+    r"""Return a squashed Gaussian over :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
 
-    DSRL's network: per layer ``Linear -> LayerNorm -> Tanh``, then location and log standard deviation
+    It has DSRL's network: per layer ``Linear -> LayerNorm -> Tanh``, then location and log standard deviation
     (clipped to [-20, 2]). The official sizes are 3 layers of 2048 on Square and 128 on Transport.
 
     Args:
@@ -142,17 +142,18 @@ def make_prior_space_actor(
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-        delta: half the side of the box; :attr:`PriorDecoder.delta`.
+        delta: half the side of the box, equal to :attr:`PriorDecoder.delta`.
         hidden_dim: width of the layers.
         num_layers: number of layers.
-        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor out if
-            it is always zero. Add ``keys.ACTIONS`` if the decoder or the next mean depends on more than the
-            anchor: for a network that sees the last actions, and for WP-Past with ``execute < H``.
+        in_keys: keys of the observation, ``[*B, To, d_o]``, and of any tensors ``[*B, P, d_a]``. Leave the
+            anchor out if it is always zero. Add ``keys.ACTIONS`` if the decoder or the next mean depends on
+            more than the anchor: for a network that sees the last actions, and for WP-Past with
+            ``execute < H``.
         distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
-            own losses; :class:`~warmprior.DSRLNALoss` takes either.
+            own losses; :class:`~warmprior.DSRLNALoss` works with either class.
 
     Raises:
-        ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
+        ValueError: if a size is not positive, or ``delta`` is not a finite number > 0.
 
     Examples:
         >>> import torch
@@ -175,7 +176,7 @@ def make_prior_space_actor(
         out_keys=[keys.DELTA],
         spec=Composite({keys.DELTA: Bounded(-delta, delta, chunk)}),
         distribution_class=distribution_class,
-        # Two event dimensions: one log-probability per chunk and not per action.
+        # Two event dimensions give one log-probability per chunk, and not per action.
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
         return_log_prob=True,
     )
@@ -193,27 +194,27 @@ def make_prior_space_critic(
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR, keys.DELTA),
     out_features: int = 1,
 ) -> ValueOperator:
-    """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
+    """Return a critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
-    The default judges residuals, for TorchRL's losses and as the noise critic of
-    :class:`~warmprior.DSRLNALoss`; ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` makes the latter's action
-    critic. It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for
-    WP-Past if whole chunks are executed. With ``execute < H`` earlier actions are part of the next mean: give
-    actor and critics ``keys.ACTIONS`` as well.
+    The default evaluates residuals, for TorchRL's losses and as the noise critic of
+    :class:`~warmprior.DSRLNALoss`, whose action critic has ``in_keys=(keys.OBSERVATION, keys.CHUNK)``. That
+    one evaluates all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for WP-Past
+    if whole chunks are executed. With ``execute < H`` earlier actions are part of the next mean: add
+    ``keys.ACTIONS`` to the keys of actor and critics.
 
     Args:
         action_dim: ``d_a``.
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-        delta: residuals are divided by it, so that the critic sees [-1, 1].
+        delta: half the side of the box, by which residuals are divided.
         hidden_dim: width of the layers.
         num_layers: number of layers.
-        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``.
-        out_features: values per input, more than one for quantile critics.
+        in_keys: keys of the observation, ``[*B, To, d_o]``, and of any tensors ``[*B, P, d_a]``.
+        out_features: number of values per input, more than one for quantile critics.
 
     Raises:
-        ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
+        ValueError: if a size is not positive, or ``delta`` is not a finite number > 0.
 
     Examples:
         >>> import torch

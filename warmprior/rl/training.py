@@ -30,10 +30,10 @@ from warmprior.training.parallel import watched
 
 
 class ReplaySegments:
-    """A folder of safetensors files, one per save, with the transitions since the one before.
+    """A folder of safetensors files, one per save, with the transitions since the last save.
 
     A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
-    training state, the next one replaces that segment. Of a folder that exists ``segments`` are kept.
+    training state, the next process replaces that segment. In an existing folder ``segments`` are kept.
     """
 
     def __init__(self, directory: Path, segments: int = 0) -> None:
@@ -49,7 +49,7 @@ class ReplaySegments:
         self._pending.append(transitions.cpu())
 
     def write(self) -> None:
-        """Write what was appended as one new segment, if anything was."""
+        """Write the appended transitions, if any, as a new segment."""
         if not self._pending:
             return
         data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
@@ -62,7 +62,7 @@ class ReplaySegments:
         self._pending.clear()
 
     def load(self) -> TensorDict | None:
-        """All committed transitions ``[N]`` or ``None``; a ``ValueError`` names a damaged segment."""
+        """Return all committed transitions ``[N]`` or ``None``; raise ValueError for a damaged segment."""
         parts = []
         for index in range(self.committed):
             path = self._path(index)
@@ -83,33 +83,33 @@ class ReplaySegments:
 
 
 class PriorSpaceTraining:
-    """Trains an agent around a frozen policy, with TorchRL's environments, losses and replay buffer.
+    """A training of an agent around a frozen policy, with TorchRL's environments, losses and replay buffer.
 
     The folder receives ``state.safetensors`` (replaced atomically at every evaluation) and the replay buffer
     in segments. Constructing the same training on it continues from the last save. Simulators cannot be
-    saved, so episodes under way at an interruption are lost.
+    saved, so unfinished episodes are lost at an interruption.
 
     Args:
-        actor: the frozen policy; put into evaluation mode.
+        actor: the frozen policy; it is set to evaluation mode.
         make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's transforms
             and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
         directory: the folder.
         evaluation_seed: simulator seed of the first evaluation episode.
-        description: of the progress bar; no bar if ``None``.
-        collect: collects elsewhere, called as ``collect(policy, make_env, num_envs=n, seed=seed)``: a context
-            manager that yields rounds of decisions, a TensorDict ``[..., n, 1]`` each. By default this
-            process collects.
+        description: label of the progress bar; no bar if ``None``.
+        collect: a context manager that collects in other processes, called as ``collect(policy, make_env,
+            num_envs=n, seed=seed)``; it yields rounds of decisions, a TensorDict ``[..., n, 1]`` each. By
+            default this process collects.
 
     Attributes:
-        agent (PriorSpaceAgent): what learns; its ``policy`` is the agent followed by the decoder.
+        agent (PriorSpaceAgent): the agent; its ``policy`` is the agent followed by the decoder.
         decoder (PriorDecoder): the frozen policy as a decoder.
-        steps (int): control steps so far, those of the warm-up included.
+        steps (int): control steps so far, including the warm-up.
         curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
-        ValueError: if the recipe does not suit the policy, or the folder's state is of another recipe, policy
-            or wiring.
+        ValueError: if the recipe does not fit the policy, or the folder's state belongs to another recipe,
+            policy or wiring.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -150,7 +150,7 @@ class PriorSpaceTraining:
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
         self.decoder, self.device = self.agent.decoder, self.agent.device
-        # A transition takes at least one control step, so that all fit.
+        # All transitions fit, because each takes at least one control step.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(config.environment_steps, device=self.device),
             batch_size=config.batch_size,
@@ -169,19 +169,19 @@ class PriorSpaceTraining:
 
     @property
     def state_path(self) -> Path:
-        """Where the training state lies."""
+        """The path of the training state."""
         return self.directory / "state.safetensors"
 
     def run(self) -> list[dict[str, Any]]:
         """Collect, learn and evaluate to the end.
 
         Returns:
-            The evaluations: ``environment_steps``, ``evaluation`` (``"base"``: the frozen policy itself;
-            ``"greedy"``, ``"stochastic"``), ``episodes``, ``successes``, ``success_rate``.
+            The evaluations, each with ``environment_steps``, ``evaluation`` (``"base"`` for the frozen policy
+            itself, ``"greedy"`` or ``"stochastic"``), ``episodes``, ``successes`` and ``success_rate``.
 
         Raises:
             KeyError: if the environment has no anchor.
-            ValueError: if the environment does not fit the policy, or executes less than ``H`` actions of a
+            ValueError: if the environment does not fit the policy, or executes fewer than ``H`` actions of a
                 chunk.
             FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
                 the last save stays.
@@ -212,9 +212,9 @@ class PriorSpaceTraining:
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
-                    found = self.agent.learn(self.buffer)
+                    metrics = self.agent.learn(self.buffer)
                     last = {row["evaluation"]: row["success_rate"] for row in self.curve}
-                    bar.set_postfix(found | last, refresh=False)
+                    bar.set_postfix(metrics | last, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises if the agent's state is not finite.
@@ -225,7 +225,7 @@ class PriorSpaceTraining:
 
     @contextmanager
     def _environment(self, seed: int) -> Iterator[EnvBase]:
-        """An environment that is closed at the end; a dead worker raises."""
+        """Yield an environment, and close it at the end; raise an error if a worker dies."""
         env = self.make_env(seed)
         with watched(env):
             yield env
@@ -233,7 +233,7 @@ class PriorSpaceTraining:
 
     @contextmanager
     def _rounds(self, num_envs: int) -> Iterator[Iterator[int]]:
-        """Collect decisions of all environments; yields the control steps of each round."""
+        """Collect decisions of all environments; yield the control steps of each round."""
         if self.collect is None:
             with self._environment(self._seed()) as env:
                 yield self._collected(env)
@@ -258,7 +258,7 @@ class PriorSpaceTraining:
         return self.steps >= self.config.warmup_steps
 
     def _seed(self) -> int:
-        # Apart from the seeds of evaluation and demonstrations; a resumed training plays new episodes.
+        # Not among the seeds of evaluation and demonstrations; a resumed training plays new episodes.
         if self.steps:
             return 1_000_000_000 + 10_000_000 * (self.config.seed % 100) + self.steps % 10_000_000
         return 6_000_000 + 100_000 * (self.config.seed % 10)
@@ -268,18 +268,18 @@ class PriorSpaceTraining:
         policy = self.agent.policy if self._learns else self.agent.warmup
         with set_exploration_type(ExplorationType.RANDOM):
             data = policy(data.to(self.device)).to(env.device or torch.device("cpu"))
-        # Before a simulator sees them.
+        # Checked before a simulator executes them.
         self._check_finite(data.select(keys.DELTA, keys.CHUNK))
         data, following = env.step_and_maybe_reset(data)
         return following, self._keep(data)
 
     def _keep(self, data: TensorDictBase) -> int:
-        """Add decisions to the replay buffer; returns the number of their control steps."""
+        """Add decisions to the replay buffer; return the number of their control steps."""
         transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
         following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
         following["terminated"] = following["done"].clone()  # DSRL treats time-outs as terminations
-        # Checked before saving: they would end every later training.
+        # Checked before saving, since a saved NaN would end every later training.
         self._check_finite(transitions)
         self._check_executed(following)
         self.buffer.extend(transitions)
@@ -291,7 +291,7 @@ class PriorSpaceTraining:
         check_finite(dict(data.items(True, True)), cause)
 
     def _check_executed(self, after: TensorDictBase) -> None:
-        """Partial execution would put actions into the next mean that the critics do not see."""
+        """Raise ValueError for partly executed chunks, because critics judge whole chunks only."""
         decoder, prior = self.decoder, self.decoder.prior
         short = (after[keys.EXECUTED] < prior.chunk_length) & ~after["done"]
         remembers = decoder.observation_key == keys.CONDITIONED or has_anchor(decoder)
@@ -304,7 +304,7 @@ class PriorSpaceTraining:
 
     @property
     def _keys(self) -> list[NestedKey]:
-        """The stored keys of a transition."""
+        """Return the stored keys of a transition."""
         states = [self.decoder.observation_key, keys.ANCHOR, *self.decoder.in_keys]
         states = [key for key in dict.fromkeys(states) if key != keys.DELTA]
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]
