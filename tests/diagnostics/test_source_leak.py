@@ -131,7 +131,7 @@ def test_neighbours_come_from_other_episodes():
     # Without episodes the other windows of one's own are neighbours, too.
     alone = data[:20].clone()
     assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
-    with pytest.raises(ValueError, match="all are of one"):
+    with pytest.raises(ValueError, match="another episode"):
         source_leak(actor, alone, episodes=episodes[:20])
 
 

@@ -23,18 +23,18 @@ def action_error(
     NFE, not one policy at several.
 
     Args:
-        policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow`;
-            held-out ones for a fair error.
+        policy: the policy; its state does not change.
+        windows: normalised windows ``[*B]`` for the policy's own prior, see :class:`~warmprior.ActionWindow`;
+            use held-out ones for a fair error.
         nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
 
     Returns:
-        By NFE, ascending and from the same samples of the source, the mean over windows, the first ``H``
-        positions inside the episode and dimensions, in squared normalised action units.
+        The error by NFE, ascending and from the same source samples: the mean over windows, dimensions and
+        the first ``H`` positions inside the episode, in squared normalised action units.
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: for bad windows, or if the policy allows none of the NFEs.
+        ValueError: if the windows are invalid, or the policy allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:

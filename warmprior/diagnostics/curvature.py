@@ -170,7 +170,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
 
 
 NO_MOTION = 0.95
-"""A field with at least this share of a zero field's loss counts as not having learnt to move."""
+"""The share of a zero field's loss from which on a field counts as not having learnt to move."""
 
 
 def curvature(
@@ -273,7 +273,7 @@ def flow_paths(
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Integration paths of a policy's flow, from its source at ``t = 0`` on, for plots (Fig. 4).
+    """Return integration paths of a policy's flow, from its source at ``t = 0`` on, for plots (Fig. 4).
 
     A policy with a :class:`~warmprior.StartPoint` takes other paths than these.
 
@@ -284,7 +284,7 @@ def flow_paths(
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
-        ``[*B, n_steps + 1, P, d_a]``, normalised action units.
+        The paths ``[*B, n_steps + 1, P, d_a]`` in normalised action units.
 
     Raises:
         KeyError: if the batch lacks a key.
@@ -314,7 +314,7 @@ def flow_paths(
 def _measure(
     policy: WarmPriorActor, a0: Tensor, observation: Tensor, n_steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean squared deviation and mean of the velocity, and the one-step error, each ``[n, P, d_a]``."""
+    """Return squared deviation and mean of the velocity, and the one-step error, each ``[n, P, d_a]``."""
     field, track = velocity_field(policy.network, observation), RunningVariance()
     end = integrate(lambda t, a: track.add(field(t, a)), a0, nfe=n_steps)
     one = a0 + field(torch.zeros_like(a0[:, 0, 0]), a0)
@@ -332,7 +332,7 @@ def _flag_no_motion(out: TensorDict, policy: WarmPriorActor, batch: TensorDictBa
     # In a rollout the chunk is the policy's own prediction.
     if batch.get(keys.CHUNK, None) is None or batch.get(keys.NOISE, None) is not None:
         return
-    # A generator of its own, so that the check does not advance the caller's.
+    # A separate generator, so that the check does not advance the caller's.
     generator = torch.Generator(out.device).manual_seed(0)
     cost = branching_cost(policy, batch, generator=generator)
     for suffix in ("", "_executed"):

@@ -29,7 +29,7 @@ from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_transforms
 
 SPLIT = 4096
-"""Largest batch of the network, for bounded memory; it changes nothing else."""
+"""The largest batch of the network, which bounds memory and changes nothing else."""
 
 
 @dataclass
@@ -58,7 +58,7 @@ class Windows:
 
 
 def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
-    """Check a batch and bring it into shape; a ``KeyError`` or ``ValueError`` says what is wrong with it."""
+    """Check and flatten a batch; raise KeyError or ValueError if it is invalid."""
     observation_key = policy.observation_key
     needed = [*policy.in_keys, *([keys.CHUNK] if target_needed else [])]
     bare = "" if policy.ode.guidance is None else "; or measure policy.replace(guidance=None)"
@@ -104,7 +104,7 @@ def check_not_empty(batch: TensorDictBase) -> None:
 def judged(
     policy: WarmPriorActor, windows: TensorDictBase
 ) -> tuple[Windows, Tensor, TensorDictBase, torch.Generator]:
-    """Windows, targets, what the policy reads, and a generator with a fixed seed."""
+    """Return windows, targets, the policy's inputs, and a generator with a fixed seed."""
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
     device = flat.loc.device
@@ -113,24 +113,24 @@ def judged(
 
 
 def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
-    """Whether a policy's chunks depend on the history of windows ``[*B]`` with encoded images."""
+    """Return True if a policy's chunks depend on the history of windows ``[*B]`` with encoded images."""
     sees = policy.sees_history or policy.start is not None
     return sees or bool(flat_windows(policy, windows).warm.any())
 
 
 def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None) -> Tensor:
-    """Where a policy's samplers start at windows ``[N]``, ``[N, P, d_a]``."""
+    """Draw the points from which a policy integrates at windows ``[N]``, ``[N, P, d_a]``."""
     inputs = rows.select(*policy.in_keys)
     options = {"generator": generator, "temperature": policy.sampling.temperature}
     return policy.sampler(inputs, **options)[keys.NOISE]
 
 
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
-    """Windows ``[n]`` whose images are encoded by the policy's network, ``split`` at a time.
+    """Return windows ``[n]`` whose images are encoded by the policy's network, ``split`` at a time.
 
     Their observation becomes the features ``[n, To, d_o]``, because diagnostics evaluate the network many
-    times at the same observations. Windows without images are returned as they are. A ``ValueError`` if there
-    are none.
+    times at the same observations. Windows without images are returned unchanged. Raises ValueError if there
+    are no windows.
 
     Examples:
         >>> import torch
@@ -155,7 +155,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
     features = torch.cat(parts)  # type: ignore[arg-type]
     result = windows.copy().to(device).set(key, features)
-    if policy.sees_history:  # the same without the last actions, which stand behind the vector
+    if policy.sees_history:  # the plain observation has no last actions, which follow the vector
         bare = windows[keys.OBSERVATION][keys.STATE].shape[-1]
         extended = observation[keys.STATE].shape[-1]
         without = torch.cat([features[..., :bare], features[..., extended:]], -1)
@@ -164,12 +164,12 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Update the last actions that a network sees beside the observation after the history has changed."""
+    """Update the last actions in a network's observation after the history has changed."""
     return HistoryObservation()(windows) if policy.sees_history else windows
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
-    """A ``ValueError`` if the field is not trained along a whole path of ``steps`` network evaluations."""
+    """Raise ValueError if the field is not trained along a path of ``steps`` network evaluations."""
     check_whole_numbers(n_steps=steps)
     most = policy.sampling.max_nfe
     if most is not None and steps > most:
@@ -178,7 +178,7 @@ def check_flow(policy: WarmPriorActor, steps: int) -> None:
 
 @contextmanager
 def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
-    """Without dropout and gradients, with the source's noise; restores every module's mode afterwards."""
+    """Turn off dropout and gradients, but not the source's noise; restore all modules' modes afterwards."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     try:
@@ -190,12 +190,12 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
 
 
 def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
-    """Those that the policy is trained for, ascending; a ``ValueError`` if none is."""
+    """Return the NFEs that the policy is trained for, ascending; raise ValueError if there are none."""
     most = policy.sampling.max_nfe
     allowed = sorted({nfe for nfe in nfes if most is None or nfe <= most})
     if not allowed:
         raise ValueError(
-            f"the policy is trained for at most NFE {most}, and {list(nfes)} has none: add {most}"
+            f"the policy is trained for at most NFE {most}, but {list(nfes)} has no such NFE: add {most}"
         )
     for nfe in allowed:
         policy.sampling.evaluations(nfe)
@@ -203,7 +203,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
 
 
 def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, nfe: int) -> Tensor:
-    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources; all finite."""
+    """Return the chunks ``[N, P, d_a]`` for windows ``[N]`` and sources, checked to be finite."""
     parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(SPLIT)
     chunk = torch.cat([policy.integrate(part, nfe).get(keys.CHUNK) for part in parts])
     check_finite({f"a prediction at NFE {nfe}": chunk}, "the policy cannot be measured")
@@ -219,7 +219,7 @@ class RunningVariance:
         self.deviations = torch.zeros(())
 
     def add(self, value: Tensor) -> Tensor:
-        """Take another one in, and return it."""
+        """Include another tensor, and return it."""
         self.count += 1
         difference = value - self.mean
         self.mean = self.mean + difference / self.count
@@ -227,7 +227,7 @@ class RunningVariance:
         return value
 
     def variance(self, *, unbiased: bool = False) -> Tensor:
-        """The variance, biased or not."""
+        """Return the variance, biased by default."""
         return self.deviations / (self.count - unbiased)
 
 
@@ -237,10 +237,9 @@ def deployed_history(
     *,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
-    """``[*B]`` with the ``"history"`` at deployment, from the policy's own prediction one decision earlier.
+    """Return ``[*B]`` with the ``"history"`` at deployment, after the policy's own previous prediction.
 
-    ``previous`` are windows ``[*B]``, ``H`` steps before those of interest in the same episodes, with the
-    history of the training.
+    ``previous`` are training windows ``[*B]``, ``H`` steps before those of interest in the same episodes.
     """
     windows = flat_windows(policy, previous)
     data = previous.select(*policy.in_keys).to(windows.loc.device)
@@ -253,21 +252,21 @@ def deployed_history(
 
 
 class SharedObservations:
-    """Observations that give policies of any prior (of one chunk length) their windows.
+    """A set of observations with windows for policies of any prior with the same chunk length.
 
-    It uses only steps with ``H`` earlier ones in their episode, so every history is complete.
+    It uses only steps with ``H`` earlier steps in their episode, so every history is complete.
 
     Args:
-        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; held-out ones for a fair
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; use held-out ones for a fair
             measure.
         chunk_length: ``H``.
         observation_steps: ``To``.
-        count: how many to draw, without replacement; all by default.
-        generator: source of the draw, on the CPU; PyTorch's global one by default.
+        count: number of observations to draw, without replacement; all by default.
+        generator: draws the observations, on the CPU; PyTorch's global generator by default.
 
     Raises:
         KeyError: if the data lack a key.
-        ValueError: if there are fewer observations than asked for.
+        ValueError: if there are fewer observations than ``count``.
 
     Examples:
         >>> from warmprior import PastPrior
@@ -305,14 +304,14 @@ class SharedObservations:
         return len(self.frames)
 
     def windows(self, prior: Prior, offset: int = 0, *, see_history: bool = False) -> TensorDictBase:
-        """Windows ``[n]`` with the history of the training, cut ``offset`` steps earlier, at most ``H``.
+        """Return training windows ``[n]``, ``offset`` steps earlier, at most ``H``.
 
-        Of the prior only the lengths matter. ``see_history`` tells whether a network sees the last actions. A
-        ``ValueError`` if the prior has another chunk length.
+        Only the lengths of the prior matter. ``see_history`` is True if the network sees the last actions.
+        Raises ValueError if the prior has another chunk length.
         """
         check_between(0, self.chunk_length, offset=offset)
         if prior.chunk_length != self.chunk_length:
-            own = f"of one chunk length: {self.chunk_length}"
+            own = f"with the same chunk length: {self.chunk_length}"
             raise ValueError(f"compare policies {own}, but {prior} has {prior.chunk_length}")
         window = window_transforms(
             self.data, prior, observation_steps=self.observation_steps, see_history=see_history
@@ -321,7 +320,7 @@ class SharedObservations:
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
     def deployed(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Windows with the history at deployment, from the policy's own earlier prediction.
+        """Return windows with the history at deployment, from the policy's own previous prediction.
 
         See :func:`deployed_history`. Observations with images are encoded, see :func:`encoded_windows`.
         """
@@ -332,7 +331,7 @@ class SharedObservations:
         return encoded_windows(policy, seen_anew(policy, windows))
 
     def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Windows as at deployment: :meth:`deployed`, if the policy depends on the history."""
+        """Return windows as at deployment: :meth:`deployed`, if the policy depends on the history."""
         see = policy.sees_history
         windows = encoded_windows(policy, self.windows(policy.prior, see_history=see))
         if depends_on_history(policy, windows):
@@ -340,7 +339,7 @@ class SharedObservations:
         return windows
 
     def subset(self, index: Tensor) -> SharedObservations:
-        """The observations with these indices, int64 ``[m]``."""
+        """Return the observations with these indices, int64 ``[m]``."""
         part = object.__new__(SharedObservations)
         part.__dict__.update(self.__dict__)
         part.frames, part.episodes = self.frames[index], self.episodes[index]

@@ -1,4 +1,4 @@
-"""How much of the source's noise, and of an error of the past, reaches the actions."""
+"""Measures of the source's noise, and of errors of the past, in the actions."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from warmprior.diagnostics.flow import (
 from warmprior.modules.actor import WarmPriorActor
 
 LEAK_BOUND = 1.0
-"""Largest leak of a sampler that spreads like the data; a larger one adds noise."""
+"""The largest leak of a sampler that spreads like the data; a larger one adds noise."""
 
 INNER_STEP_BOUND = 1.3
-"""Largest inner step ratio of a sound policy, which is near 1 or, at few steps, below."""
+"""The largest inner step ratio of a sound policy, whose ratio is near 1 or, at few steps, below."""
 
 DISTANCES = 2**22
-"""Distances between observations held at a time: 16 MiB in single precision."""
+"""The number of distances between observations held at a time: 16 MiB in single precision."""
 
 
 @dataclass(frozen=True)
 class SourceLeak:
-    """How the source's noise shows in the executed actions, in normalised action units.
+    """The noise of the source in the executed actions, in normalised action units.
 
     Attributes:
         nfe: network evaluations per chunk.
         spread: standard deviation of predictions over draws of the source at fixed observation and mean, root
             mean square over windows, positions and dimensions.
-        data_spread: the same for the targets at similar observations.
-        ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
+        data_spread: standard deviation of the targets at similar observations, averaged in the same way.
+        ratio_to_last: ratio of ``spread`` to that at the largest ``nfe`` measured.
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
-        data_inner_step: the same of the targets.
+        data_inner_step: mean distance between consecutive actions inside the targets.
 
     Examples:
         >>> from warmprior.diagnostics import SourceLeak
@@ -68,12 +68,12 @@ class SourceLeak:
 
     @property
     def leak(self) -> float:
-        """Spread over the data's; NaN where the data do not spread."""
+        """The ratio of the spread to the data's; NaN if the data do not spread."""
         return _ratio(self.spread, self.data_spread)
 
     @property
     def inner_step_ratio(self) -> float:
-        """Inner step over the data's; NaN where the data do not move."""
+        """The ratio of the inner step to the data's; NaN if the data do not move."""
         return _ratio(self.inner_step, self.data_inner_step)
 
     @property
@@ -101,7 +101,7 @@ def source_leak(
     draws: int = 8,
     episodes: Tensor | None = None,
 ) -> dict[int, SourceLeak]:
-    r"""How far predictions spread over draws of the source, relative to the data.
+    r"""Measure how far predictions spread over draws of the source, relative to the data.
 
     An exact sampler spreads at most like the targets at the same observation, so the leak is at most 1. A
     velocity network that has not learnt to ignore the noise at ``t = 0`` passes it on to the actions, most of
@@ -116,7 +116,7 @@ def source_leak(
     or past an episode's end do not count.
 
     Args:
-        policy: the policy; its state stays as it is.
+        policy: the policy; its state does not change.
         windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets ``[*B, P,
             d_a]``, normalised, see :meth:`SharedObservations.windows`.
         nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
@@ -129,7 +129,7 @@ def source_leak(
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: for bad windows or options, or a single episode.
+        ValueError: if the windows or options are invalid, or there is a single episode.
         FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:
@@ -151,7 +151,7 @@ def source_leak(
     episodes = torch.arange(n) if episodes is None else episodes.flatten()
     check_shape("episodes of the windows", episodes, (n,))
     if len(episodes.unique()) < 2:
-        raise ValueError("each window is compared with one of another episode, and all are of one")
+        raise ValueError("each window is compared with one from another episode: at least 2 are needed")
     target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
@@ -212,7 +212,7 @@ def memory_gain(
     nfes: Sequence[int] = (1, 9),
     shift: float = 0.05,
 ) -> dict[int, float]:
-    r"""How much of a shift of the history reappears in the executed actions.
+    r"""Measure how far executed actions move when the history is shifted: 0 = ignored, 1 = copied.
 
     At the same observation and source noise, all actions of the history and its forecast are moved by
     :math:`\pm\delta e`, with a random unit direction :math:`e` per window. The gain is
@@ -232,21 +232,21 @@ def memory_gain(
     one Euler step, and :math:`s / \sqrt{s^2 + V}` at infinitely many.
 
     Windows without a history do not count. Actions beyond the policy's ``clip`` count as 0. The leftover that
-    guides a policy stays as it is.
+    guides a policy is not shifted.
 
     Args:
-        policy: the policy; its state stays as it is.
+        policy: the policy; its state does not change.
         windows: ``[*B]`` of the policy's own prior, normalised, see :meth:`SharedObservations.windows`.
             Images may be encoded, unless the network sees the history.
         nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
         shift: :math:`\delta`, in normalised action units.
 
     Returns:
-        By NFE, ascending; 0 if no window has a history, NaN if no position is inside an episode.
+        The gain by NFE, ascending; 0 if no window has a history, NaN if no position is inside an episode.
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: for bad windows or options, or if the observation's last actions differ from the
+        ValueError: if the windows or options are invalid, or the observation's last actions differ from the
             history's.
         FloatingPointError: if a prediction is NaN or infinite.
 
@@ -300,7 +300,7 @@ def memory_gain(
 
 
 def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
-    """A history with its real actions and forecast moved by ``[*B, n, d_a]``; empty entries stay zero."""
+    """Return a history with real actions and forecast moved by ``[*B, n, d_a]``; empty entries stay zero."""
     moved = history.copy()
     for name, from_end in (("actions", True), ("forecast", False)):
         entry, steps = history[name], history["steps" if from_end else "forecast_steps"]
@@ -314,17 +314,17 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
     if not policy.sees_history:
         return
     key = policy.observation_key
-    given, made = windows.get(key), seen_anew(policy, windows.copy()).get(key)
-    if isinstance(given, TensorDictBase):
-        given, made = given.get(keys.STATE), made.get(keys.STATE)
-    if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
+    stored, updated = windows.get(key), seen_anew(policy, windows.copy()).get(key)
+    if isinstance(stored, TensorDictBase):
+        stored, updated = stored.get(keys.STATE), updated.get(keys.STATE)
+    if stored.shape != updated.shape or not torch.allclose(stored.to(updated.dtype), updated):
         raise ValueError(f"{key!r} does not end in the windows' last actions: do not encode images before")
 
 
 class HistoryShift(TensorDictModuleBase):
-    """Adds normal noise to the history that a policy reads, actions and forecast, at every decision.
+    """A policy with normal noise on the history that it reads, actions and forecast, at every decision.
 
-    The environment's own history stays as it is.
+    The environment's own history does not change.
 
     Args:
         policy: the policy.

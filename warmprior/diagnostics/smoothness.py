@@ -1,4 +1,4 @@
-"""How smoothly executed actions continue across chunk boundaries."""
+"""The smoothness of executed actions across chunk boundaries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warmprior.transforms.delay import executed_chunk
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Smoothness of the executed actions; NaN where there was nothing to measure.
+    """The smoothness of executed actions; NaN where there was nothing to measure.
 
     Attributes:
         boundary_jump: mean distance between the last action of a chunk and the first of the next.
@@ -37,22 +37,22 @@ class Smoothness:
 
     @property
     def jump_ratio(self) -> float:
-        """Boundary jump over inner jump; 1 if chunk ends make no difference."""
+        """The ratio of boundary jump to inner jump; 1 if chunk ends make no difference."""
         return self.boundary_jump / self.inner_jump if self.inner_jump else math.nan
 
 
 def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-    """The actions that were executed, in order, from the chunks of a rollout.
+    """Return the executed actions, in order, from the chunks of a rollout.
 
     Args:
-        rollout: ``[*B, D]`` decisions, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
+        rollout: decisions ``[*B, D]``, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside, ``("next", "done")``;
-            where chunks take effect late, also the delay that :class:`InferenceDelay` writes.
+            if chunks take effect late, also the delay that :class:`InferenceDelay` writes.
 
     Returns:
-        The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest; the
-        index of the decision that predicted them, int64 ``[*B, T]``, -1 where filled up; and that of their
-        episode, likewise.
+        The actions ``[*B, T, d_a]``, padded with NaN where a row executed fewer than the longest; the index
+        of the decision that predicted each, int64 ``[*B, T]``, and the index of its episode, int64
+        ``[*B, T]``, both -1 where padded.
 
     Raises:
         KeyError: if a key is missing.
@@ -101,9 +101,10 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def smoothness(rollout: TensorDictBase) -> Smoothness:
-    """Jumps at and inside chunk boundaries, and jerk, of a rollout (:func:`executed_actions`).
+    """Measure jumps at chunk boundaries and inside chunks, and jerk, of a rollout.
 
-    Means over all boundaries, steps and rows, in normalised action units.
+    They are means over all boundaries, steps and rows, in normalised action units, of the actions from
+    :func:`executed_actions`.
 
     Raises:
         KeyError: if a key is missing.
@@ -123,7 +124,7 @@ def smoothness(rollout: TensorDictBase) -> Smoothness:
     together = (episode[..., 1:] == episode[..., :-1]) & (episode[..., 1:] >= 0)
     boundary = together & (decision[..., 1:] != decision[..., :-1])
     if not boundary.any():
-        raise ValueError("the rollout has no chunk boundary: it needs two decisions of one episode")
+        raise ValueError("the rollout has no chunk boundary: it needs two decisions in one episode")
     jump = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
     jerk = math.nan
     if actions.shape[-2] > 3:

@@ -9,7 +9,7 @@ from warmprior.io.extras import require
 
 
 def success_posterior(successes: float, episodes: float) -> Any:
-    """Posterior of a success rate under a uniform prior, Beta(k + 1, n - k + 1) (appendix A).
+    """Return the posterior of a success rate under a uniform prior, Beta(k + 1, n - k + 1) (appendix A).
 
     Args:
         successes: ``k``, or its mean over several checkpoints that played the same episodes.
