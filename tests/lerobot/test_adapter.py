@@ -265,7 +265,7 @@ def test_batches_that_do_not_fit(policy):
         adapter.predict_action_chunk(observations("pi05", 3))
     with pytest.raises(ValueError, match="executed_steps="):
         adapter.predict_action_chunk(observations("pi05", 2))
-    with pytest.raises(ValueError, match="the prior gives noise="):
+    with pytest.raises(ValueError, match="noise="):
         adapter.predict_action_chunk(
             observations("pi05", 2), executed_steps=1, noise=torch.zeros(2, LENGTH, 12)
         )

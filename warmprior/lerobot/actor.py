@@ -22,11 +22,11 @@ from warmprior.modules.prior import Prior, noise_factor
 
 
 class LeRobotFlow(TensorDictModuleBase):
-    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.
+    """The sampler of a LeRobot policy, which replaces :class:`~warmprior.ODEActor`.
 
-    A deterministic map ``(noise, observation) -> chunk``, ``[*B, P, d_a]`` in the model's units: the padding
-    around the prior's part is one fixed draw, unless a call passes its own. The policy's weights are not
-    among its parameters. Options as of :class:`LeRobotActor`.
+    It is a deterministic map ``(noise, observation) -> chunk``, ``[*B, P, d_a]`` in the model's units: the
+    padding around the prior's part is one fixed draw, unless a call passes its own. The policy's weights are
+    not among its parameters. The options are those of :class:`LeRobotActor`.
     """
 
     guidance = None
@@ -43,11 +43,10 @@ class LeRobotFlow(TensorDictModuleBase):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.sampling = Sampling(nfe=nfe)  # the model's own number of steps where none is given
-        # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
-        # contain this.
+        self.sampling = Sampling(nfe=nfe)  # by default the model's own number of steps
+        # Not a submodule: agents that contain this module must not train or save billions of weights.
         self._policy = (policy,)
-        self.source = self.network = source  # which has the width of actions
+        self.source = self.network = source  # the source has the width of actions
         inputs = policy.config.input_features
         self.names = {n.rpartition(".")[2]: n for n in inputs} if names is None else dict(names)
         self.preprocess = preprocess
@@ -63,7 +62,7 @@ class LeRobotFlow(TensorDictModuleBase):
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, padding: Tensor | None = None
     ) -> TensorDictBase:
-        """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
+        """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside the prior's part."""
         nfe = self.sampling.nfe if nfe is None else self.sampling.evaluations(nfe)
         noise = tensordict[keys.NOISE]
         if torch.is_grad_enabled() and noise.requires_grad:
@@ -83,7 +82,7 @@ class LeRobotFlow(TensorDictModuleBase):
         def draw(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
             return whole.to(dtype=dtype, device=device)
 
-        # A policy of the plugin has a source of its own, which this one replaces.
+        # This source replaces that of a policy of the plugin.
         own = getattr(self.policy, "warm_adapter", None)
         with (
             nullcontext() if own is None else own.aside(),
@@ -117,31 +116,31 @@ class LeRobotActor(TensorDictModuleBase):
 
     ``(observation, history) -> (loc, warm, noise, chunk)``: it acts in ``env.rollout`` and collectors behind
     :func:`~warmprior.policy_transforms`, and :class:`~warmprior.PriorDecoder` takes it as a frozen policy.
-    Every decision draws the rest of the model's source anew (padded dimensions, positions before the chunk);
-    :class:`~warmprior.PriorDecoder` keeps it fixed. Chunks are in the model's units: denormalise them next to
-    the environment.
+    Every decision draws new values for the rest of the model's source (padded dimensions, positions before
+    the chunk); :class:`~warmprior.PriorDecoder` keeps them fixed. Chunks are in the model's units:
+    denormalise them directly after the environment.
 
     Args:
-        policy: of LeRobot, see :class:`WarmPriorAdapter`; or such an adapter.
-        prior: the source distribution that it was trained with; by default that of the adapter, or of a
-            policy of the plugin.
+        policy: a policy of LeRobot, see :class:`WarmPriorAdapter`, or such an adapter.
+        prior: the source distribution that the policy was trained with; by default that of the adapter, or of
+            a policy of the plugin.
 
     Keyword Args:
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
-        generator: source of randomness; per call: ``actor(data, generator=...)``.
+        generator: source of randomness, also per call: ``actor(data, generator=...)``.
         names: LeRobot's name of each entry of the observation, such as
             ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; by default the
             last part of LeRobot's. An observation that is a tensor ``[*B, To, d]`` is ``observation.state``.
             Images of bytes become floats in [0, 1].
-        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
+        preprocess: converts raw observations to the policy's batch, such as LeRobot's preprocessor; none by
             default.
-        postprocess: turns actions ``[1, d_a]`` into those of a robot, such as LeRobot's postprocessor, for
+        postprocess: converts actions ``[1, d_a]`` to those of a robot, such as LeRobot's postprocessor, for
             :class:`~warmprior.deploy.AsyncExecutor`; none by default.
         nfe: integration steps per chunk; the policy's own by default.
-        seed: of the padding under a decoder.
+        seed: seed of the padding under a decoder.
 
     Raises:
-        ValueError: see :class:`WarmPriorAdapter`; or if the prior is missing, or an adapter has guidance.
+        ValueError: see :class:`WarmPriorAdapter`; also if the prior is missing, or an adapter has guidance.
         KeyError: (when called) if an entry of the history is missing.
 
     Examples:
@@ -177,7 +176,7 @@ class LeRobotActor(TensorDictModuleBase):
         if adapter is not None:
             policy = adapter.policy
             if adapter.guidance is not None:
-                raise ValueError("LeRobotActor has no guidance: give it an adapter without")
+                raise ValueError("LeRobotActor has no guidance: give it an adapter without guidance")
             nfe = adapter.nfe if nfe is None else nfe
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError("relative actions (use_relative_actions) need WarmPriorAdapter")
@@ -201,12 +200,12 @@ class LeRobotActor(TensorDictModuleBase):
 
     @property
     def sampling(self) -> Sampling:
-        """How a chunk is drawn."""
+        """The options for drawing a chunk."""
         return self.ode.sampling
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]] | None:
-        """Of one step's entries, by name; ``None`` where some are for ``preprocess`` alone."""
+        """The shapes of one step's entries, by name; ``None`` if only ``preprocess`` knows them."""
         features, names = self.ode.policy.config.input_features, self.ode.names
         if not set(names.values()) <= set(features):
             return None
@@ -214,13 +213,13 @@ class LeRobotActor(TensorDictModuleBase):
 
     @property
     def device(self) -> torch.device:
-        """Where LeRobot's policy is."""
+        """The device of LeRobot's policy."""
         return next(self.ode.policy.parameters()).device
 
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
-        """Sample the source and the chunk."""
+        """Draw the source and the chunk."""
         chunks, generator = self.ode.source, self.generator if generator is None else generator
         source = chunks.distribution(tensordict.get(keys.HISTORY, None))
         loc, a0 = (

@@ -19,18 +19,18 @@ from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
 
 class RelativeActions:
-    """Expresses remembered relative actions at the present state.
+    """A conversion of remembered relative actions to the current state.
 
-    Policies with relative actions (``use_relative_actions``) predict offsets from the state of the decision,
-    so a mean from one chunk ago is an offset from where the robot was then.
+    Policies with relative actions (``use_relative_actions``) predict offsets from the state at the decision,
+    so a mean from one chunk ago is an offset from the robot's state at that time.
 
     Args:
-        preprocessor: the policy's pipeline; its step ``RelativeActionsProcessorStep`` holds the raw state of
-            the last observation, so the pipeline must have run before each decision.
-        postprocessor: the policy's pipeline, which undoes the normalisation.
+        preprocessor: the policy's preprocessing pipeline; its step ``RelativeActionsProcessorStep`` holds the
+            raw state of the last observation, so the pipeline must run before each decision.
+        postprocessor: the policy's postprocessing pipeline, which undoes the normalisation.
 
     Raises:
-        ValueError: if the pipelines lack the steps, or have relative actions turned off.
+        ValueError: if the pipelines lack the steps, or relative actions are turned off in them.
 
     Examples:
         >>> from warmprior.lerobot import RelativeActions
@@ -61,15 +61,15 @@ class RelativeActions:
             raise ValueError("relative actions are off in the pipeline: leave relative= out")
 
     def state(self) -> Tensor:
-        """Raw state of the last observation, ``[B, d_s]``; a ``ValueError`` if there was none."""
+        """Return the raw state of the last observation, ``[B, d_s]``; raise ValueError without one."""
         state = self._relative.get_cached_state()
         if state is None:
             raise ValueError("run the preprocessor before the policy decides: it holds the state")
-        # The last of several observations.
+        # Of several observations, the last one counts.
         return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
 
     def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
-        """Express actions ``[B, *, d_a]`` relative to one raw state ``[B, d_s]`` relative to another."""
+        """Convert actions ``[B, *, d_a]`` relative to the raw state ``before``, ``[B, d_s]``, to ``now``."""
         from lerobot.processor import (
             TransitionKey,
             create_transition,
@@ -87,28 +87,28 @@ class RelativeActions:
 
 
 HISTORY = "action_history"
-"""The actions before the current step, if they are not in front of ``"action"``."""
+"""The key of the actions before the current step, if they do not precede ``"action"``."""
 
 HISTORY_IS_PAD = f"{HISTORY}_is_pad"
 
 LEFT_OVER = "prev_chunk_left_over"
-"""What LeRobot's real-time chunking calls the actions that are left of the last chunk."""
+"""The name in LeRobot's real-time chunking of the actions that are left of the last chunk."""
 
 
 def with_width(batch: Mapping[str, Any], widths: Mapping[str, int]) -> dict[str, Any]:
-    """A batch of windows whose features of width 1 have that dimension, which LeRobotDataset leaves out.
+    """Return a batch of windows in which features of width 1 are ``[B, T, 1]``.
 
-    They are ``[B, T]`` there, and ``[B, T, d]`` here.
+    LeRobotDataset returns them as ``[B, T]``.
     """
     short = {n: batch[n] for n, width in widths.items() if width == 1 and n in batch and batch[n].ndim == 2}
     return {**batch, **{name: value.unsqueeze(-1) for name, value in short.items()}}
 
 
 def history_indices(history_length: int, length: int, lead: int = 0) -> list[int]:
-    """Dataset steps of a training window, for ``action_delta_indices``.
+    """Return the dataset steps of a training window, for ``action_delta_indices``.
 
     Args:
-        history_length: of the prior, usually ``H``.
+        history_length: number of remembered actions, usually ``H``.
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
 
@@ -121,22 +121,22 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
 
 
 class WarmPriorAdapter:
-    """Trains and runs an unmodified flow policy of LeRobot from a prior's source.
+    """An adapter that trains and runs an unmodified flow policy of LeRobot from a prior's source.
 
     It supports pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA of lerobot 0.6, and
     GR00T N1.5 of lerobot 0.5.1. It replaces the noise that loss and sampler draw, exactly once each, or
-    raises an error. Everything is in the model's own units, after LeRobot's preprocessor and before its
+    raises an error. All values are in the model's own units, after LeRobot's preprocessor and before its
     postprocessor.
 
-    For training, the dataset gives ``H`` more actions in front of each chunk: set
-    ``delta_timestamps["action"]`` to :attr:`action_indices` over the frame rate. They come in
+    For training, the dataset must return ``H`` more actions before each chunk: set
+    ``delta_timestamps["action"]`` to :attr:`action_indices` divided by the frame rate. They are part of
     ``batch["action"]`` ``[B, H + T, d_a]``, and ``batch["action_is_pad"]`` marks those before the episode.
-    LeRobot fills these with the episode's first action, which is the target, so they are never used. GR00T's
+    LeRobot pads these with the episode's first action, i.e. with the target, so they are never used. GR00T's
     preprocessor cuts longer chunks: pass the history as ``"action_history"`` with
     ``"action_history_is_pad"``.
 
     Args:
-        policy: of LeRobot.
+        policy: a policy of LeRobot.
         prior: the source distribution. ``H`` is its ``chunk_length``; it may predict fewer actions than
             the policy, whose later positions then start cold.
 
@@ -144,11 +144,11 @@ class WarmPriorAdapter:
         std: standard deviation of the data in the model's units, ``[d_a]`` (see :func:`action_std`), if
             ``sigma`` is in units of it, which do not depend on the normalisation; by default ``sigma`` is in
             the normalised action space, as in the paper.
-        relative: expresses remembered actions at the next state, for policies with relative actions.
+        relative: converts remembered actions to the next state, for policies with relative actions.
         cold_probability: share of the training windows whose history is withheld.
         nfe: integration steps per chunk; the policy's own by default.
-        guidance: of chunks towards the rest of the last one, :class:`~warmprior.RealTimeChunking`, for pi0,
-            pi0.5 and SmolVLA; none by default.
+        guidance: guides chunks towards the rest of the last one, :class:`~warmprior.RealTimeChunking`, for
+            pi0, pi0.5 and SmolVLA; none by default.
         generator: source of randomness on the policy's device; PyTorch's global one by default.
 
     Raises:
@@ -192,17 +192,17 @@ class WarmPriorAdapter:
             check_whole_numbers(nfe=nfe)
         self.guidance = guidance
         if guidance is not None:
-            self.source.port.guiding(policy, self._guided)  # refuses what cannot be guided
+            self.source.port.guiding(policy, self._guided)  # raises if the policy cannot be guided
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
-        # Raw states at the last decision, and at the one under way.
+        # Raw states at the last decision, and at the current one.
         self._state: Tensor | None = None
         self._now: Tensor | None = None
         self._sampling = False
-        # Control steps until the chunk under way takes effect; of the last one the rest, how much is left,
-        # the delay, and the width of the source, all over the whole chunk.
+        # Control steps until the new chunk takes effect; and the last chunk's rest, number of actions left,
+        # delay and source width, all over the whole chunk.
         self._delay = 0
-        # Actions that predict_action_chunk returned last.
+        # The number of actions that predict_action_chunk returned last.
         self._given = 0
         self._rest: tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -212,16 +212,16 @@ class WarmPriorAdapter:
         return history_indices(self.prior.history_length, self.source.length, self.source.lead)
 
     def loss(self, batch: Mapping[str, Any], forward: Callable[..., Any] | None = None, **kwargs: Any) -> Any:
-        """The policy's own loss and information, from the prior's source.
+        """Return the policy's own loss and information, with the prior's source.
 
         Args:
-            batch: preprocessed, with history; see the class.
+            batch: a preprocessed batch with history, see the class.
             forward: the policy's ``forward`` by default.
-            kwargs: handed to it.
+            kwargs: arguments of ``forward``.
 
         Raises:
             KeyError: if ``"action"`` or its mask is missing.
-            ValueError: if the window or its mask has another length, or noise is given.
+            ValueError: if the window or its mask has another length, or noise is passed.
         """
         check_no_noise(kwargs)
         before, valid, target, is_pad = self._window(with_width(batch, {"action": self.source.action_dim}))
@@ -241,16 +241,16 @@ class WarmPriorAdapter:
     def select_action(
         self, batch: dict[str, Any], select: Callable[..., Tensor] | None = None, **kwargs: Any
     ) -> Tensor:
-        """The next action of every environment, ``[B, d_a]``, the model's units.
+        """Return the next action of every environment, ``[B, d_a]``, in the model's units.
 
         Args:
             batch: a preprocessed observation.
             select: the policy's ``select_action`` by default.
-            kwargs: handed to it.
+            kwargs: arguments of ``select``.
 
         Raises:
-            ValueError: if there are other environments than before, :meth:`reset` first; or if guidance has
-                nothing to continue, because all actions of a chunk are executed.
+            ValueError: if the number of environments changes without :meth:`reset`, or guidance has no
+                leftover actions, because ``n_action_steps`` is the whole chunk.
         """
         steps, length = self.policy.config.n_action_steps, self.prior.prediction_length
         if self.guidance is not None and steps >= length:
@@ -269,24 +269,24 @@ class WarmPriorAdapter:
         delay: int = 0,
         **kwargs: Any,
     ) -> Tensor:
-        """A new chunk, ``[B, T', d_a]`` in the model's units, of no more actions than the prior predicts.
+        """Return a new chunk, ``[B, T', d_a]`` in the model's units, with at most the prior's positions.
 
-        With a delay its first actions are the rest of the last chunk, which is executed meanwhile. What
-        LeRobot's real-time chunking passes, ``prev_chunk_left_over=`` and ``inference_delay=``, tells both:
-        how many actions of the last chunk were executed, and the delay.
+        With a delay its first actions are the rest of the last chunk, which is executed in the meantime. The
+        arguments of LeRobot's real-time chunking, ``prev_chunk_left_over=`` and ``inference_delay=``, can
+        replace ``executed_steps`` and ``delay``.
 
         Args:
             batch: a preprocessed observation.
-            executed_steps: actions executed of the last chunk: a number, for all environments that were not
+            executed_steps: number of executed actions of the last chunk, for all environments that were not
                 reset since, or ``[B]``; by default as many as :meth:`select_action` returned.
             predict: the policy's ``predict_action_chunk`` by default.
             delay: control steps until the chunk takes effect.
-            kwargs: handed to it.
+            kwargs: arguments of ``predict``.
 
         Raises:
-            ValueError: see :meth:`select_action`; also if nothing tells how many actions were executed, what
-                is left over is no part of the last chunk, more were executed than a chunk has, or fewer are
-                left than the delay needs.
+            ValueError: see :meth:`select_action`; also if the number of executed actions is unknown or
+                exceeds the chunk, the leftover is not part of the last chunk, or it is shorter than the
+                delay.
         """
         call = self.policy.predict_action_chunk if predict is None else predict
         if self._sampling:  # on the way from select_action
@@ -309,35 +309,35 @@ class WarmPriorAdapter:
         return chunk
 
     def record_executed(self, action: Tensor) -> None:
-        """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
+        """Replace the last action of :meth:`select_action` by the executed one, for instance after clipping.
 
-        It is ``[B, d_a]`` in the model's units. A ``ValueError`` if none was given yet.
+        It is ``[B, d_a]`` in the model's units. Raises ValueError if no action was returned yet.
         """
         self._memory.correct(action)
 
     def reset(self, mask: Tensor | None = None) -> None:
         """Begin new episodes, whose next chunk starts cold, in the environments of a mask, bool ``[B]``.
 
-        In all by default, which also resets the policy. All environments share LeRobot's queue of actions, so
-        the rest of its chunk is executed in any case.
+        By default all environments and the policy are reset. All environments share LeRobot's queue of
+        actions, so with a mask the rest of its chunk is still executed.
         """
         self.forget(mask)
         if mask is None:
             self.policy.reset()
 
     def forget(self, mask: Tensor | None = None) -> None:
-        """As :meth:`reset`, without resetting the policy."""
+        """Begin new episodes as :meth:`reset` does, without resetting the policy."""
         self._memory.forget(mask)
 
     def _expect(self, batch: Mapping[str, Any]) -> None:
-        """Refuse other environments, also while LeRobot's queue has actions of the last ones."""
+        """Raise ValueError if the number of environments changes, even while LeRobot's queue has actions."""
         state = next((batch[name] for name in ("observation.state", "state") if name in batch), None)
         if state is not None:
             self._memory.expect(len(state))
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Inside, a policy of the plugin samples as its base class does, without its adapter."""
+        """Let a policy of the plugin sample as its base class does, without its adapter."""
         before, self._sampling = self._sampling, True
         try:
             yield
@@ -352,13 +352,13 @@ class WarmPriorAdapter:
             yield
 
     def _guided(self, velocity: Velocity) -> Velocity:
-        """A velocity of the whole chunk, guided towards the rest of the last one."""
+        """Return a velocity of the whole chunk, guided towards the rest of the last one."""
         assert self.guidance is not None
         rest, left, delay, scale = self._rest
         return self.guidance.guided(velocity, rest, left, delay, scale)
 
     def _spliced(self, chunk: Tensor) -> Tensor:
-        """A chunk, in whose place the last one is still executed until it takes effect."""
+        """Return a chunk whose first actions, until it takes effect, are those of the last chunk."""
         rest, _, delay, _ = self._rest
         return with_leftover(chunk, rest[:, : chunk.shape[1], : chunk.shape[2]], delay)
 
@@ -369,7 +369,7 @@ class WarmPriorAdapter:
             expected = {"action": length, HISTORY: history}
         if missing := [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]:
             raise KeyError(
-                f"the batch lacks {' and '.join(missing)}: LeRobotDataset gives it by delta_timestamps"
+                f"the batch lacks {' and '.join(missing)}: set delta_timestamps of the LeRobotDataset"
             )
         lengths = {key: batch[key].shape[1] for key in expected}
         if lengths != expected:
@@ -386,7 +386,7 @@ class WarmPriorAdapter:
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """A draw of the source of every environment."""
+        """Draw the source of every environment."""
         move = None
         if self._relative is not None:
             relative, before, now = self._relative, self._state, self._relative.state()

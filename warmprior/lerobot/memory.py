@@ -1,4 +1,4 @@
-"""The history of a batch of robots, where no environment keeps it."""
+"""The history of a batch of robots without environments that keep it."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from warmprior.modules.prior import Prior
 class ActionMemory:
     """The history (:mod:`warmprior.history`) from decision to decision, one row per environment.
 
-    The counterpart of :class:`~warmprior.ActionHistory`: LeRobot's environments keep nothing, and its
-    policies share one queue of actions for all rows.
+    It is the counterpart of :class:`~warmprior.ActionHistory`: LeRobot's environments keep no history, and
+    its policies share one queue of actions for all rows.
     """
 
     def __init__(self, prior: Prior, action_dim: int) -> None:
         self.prior = prior
         self.action_dim = action_dim
-        # None between episodes; the others are of the same decision.
+        # None between episodes; the attributes below belong to the same decision.
         self._chunk: Tensor | None = None
         # Rows whose episode began since the decision before, bool [B].
         self.began = torch.empty(0, dtype=torch.bool)
-        # The history of the decision under way counts once there is a chunk, since a sampler may fail.
+        # The history of the current decision is only stored with its chunk, since a sampler may fail.
         self._history = self._decision = TensorDict()
         self._executed = self._new = torch.empty(0)
-        # Whether it is known how many actions of the chunk were executed.
+        # True once the number of executed actions of the chunk is known.
         self._counted = False
 
     def decide(
@@ -40,9 +40,9 @@ class ActionMemory:
         device: torch.device | str = "cpu",
         move: Callable[[Tensor], Tensor] | None = None,
     ) -> TensorDict:
-        """The history ``[B]`` at the next decision; ``move`` expresses actions of the last one, at this one.
+        """Return the history ``[B]`` at the next decision; ``move`` converts actions to its state.
 
-        A ``ValueError`` if there are other environments than before, or nobody told what was executed.
+        Raises ValueError if the number of environments changes, or that of executed actions is unknown.
         """
         self.expect(batch_size)
         if self._chunk is None:
@@ -51,16 +51,16 @@ class ActionMemory:
             history = cold_history([batch_size], *lengths, self.action_dim, device=device)
         elif not self._counted:
             raise ValueError(
-                "how many actions of the last chunk were executed is not known: give executed_steps= to "
+                "the number of executed actions of the last chunk is unknown: give executed_steps= to "
                 "predict_action_chunk, or prev_chunk_left_over= as LeRobot's real-time chunking does"
             )
         else:
             self.began = self._new
             history = caught_up(self._history, self._chunk, self._executed)
-            # The rest of the chunk belongs to an episode that is over.
+            # The rest of the chunk belongs to an episode that has ended.
             cold = without(history, self._new)
             history.update(cold.select("forecast", "forecast_steps"))
-            if move is not None:  # where there is no action, it stays empty
+            if move is not None:  # empty entries stay empty
                 line = torch.cat([history["actions"], history["forecast"]], 1)
                 step = torch.arange(line.shape[1], device=line.device) - history["actions"].shape[1]
                 real = (step >= -history["steps"]) & (step < history["forecast_steps"])
@@ -70,7 +70,7 @@ class ActionMemory:
         return history
 
     def record(self, chunk: Tensor) -> None:
-        """Remember what was predicted at this decision, ``[B, P, d_a]``."""
+        """Remember the chunk of this decision, ``[B, P, d_a]``."""
         self._history = self._decision
         self._chunk = chunk.detach().to(self._history["forecast"], copy=True)
         self._executed = torch.zeros_like(self._history["steps"])
@@ -78,20 +78,21 @@ class ActionMemory:
         self._counted = False
 
     def expect(self, batch_size: int) -> None:
-        """Raise ValueError if a chunk is of other environments."""
+        """Raise ValueError if the last chunk has another number of environments."""
         if self._chunk is not None and len(self._chunk) != batch_size:
             raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
 
     def step(self) -> None:
-        """One more action of the chunk is executed."""
+        """Count one more executed action of the chunk."""
         self._executed, self._counted = self._executed + 1, True
 
     def left_over(self, rest: Tensor | None, given: int) -> int:
-        """Count what was executed by what is left of the chunk, and return how much that is, at the least.
+        """Infer the number of executed actions from the rest of the chunk; return the smallest rest.
 
-        Of the chunk so many actions were ``given``. The rest is ``[B, n, d_a]``, or ``[n, d_a]`` of one
-        environment: any number of actions from the next one on, with zeros behind the last. ``None`` stands
-        for a new episode, as in LeRobot's rollouts. A ``ValueError`` if the chunk has no such part.
+        The policy returned the first ``given`` actions of the chunk. The rest is ``[B, n, d_a]``, or
+        ``[n, d_a]`` for one environment: any number of actions from the next one on, with zeros after the
+        last. ``None`` stands for a new episode, as in LeRobot's rollouts. Raises ValueError if the rest is
+        not part of the chunk.
         """
         if rest is None:
             self.forget()
@@ -105,17 +106,18 @@ class ActionMemory:
         begins = torch.stack(same, 1)
         if not begins.any(1).all():
             raise ValueError(
-                "prev_chunk_left_over is no part of the last chunk, so what was executed is not known: give "
-                "executed_steps=, or reset() for a new episode"
+                "prev_chunk_left_over is not part of the last chunk, so the number of executed actions is "
+                "unknown: give executed_steps=, or reset() for a new episode"
             )
         executed = first + begins.int().argmax(1)
         self.executed(executed)
         return given - int(executed.max())
 
     def executed(self, steps: int | Tensor) -> None:
-        """Set how many actions of the chunk were executed, from 0 to ``prediction_length``.
+        """Set the number of executed actions of the chunk, from 0 to ``prediction_length``.
 
-        A number is for all environments whose episode goes on; ``[B]`` counts a new episode's own actions.
+        One number applies to all environments whose episode continues; ``[B]`` also counts the actions of new
+        episodes.
         """
         if self._chunk is None:
             return
@@ -127,14 +129,14 @@ class ActionMemory:
         self._counted = True
 
     def correct(self, action: Tensor) -> None:
-        """Replace the action executed last by this one, ``[B, d_a]``; a ``ValueError`` if there is none."""
+        """Replace the action executed last, ``[B, d_a]``; raise ValueError if there is none."""
         if self._chunk is None or not self._executed.all():
-            raise ValueError("no action was given since the last decision: nothing to correct")
+            raise ValueError("no action was executed since the last decision: there is nothing to correct")
         last = (self._executed - 1)[..., None].expand(-1, 1, self.action_dim)
         self._chunk = self._chunk.scatter(1, last, action.to(self._chunk)[:, None])
 
     def forget(self, mask: Tensor | None = None) -> None:
-        """Begin new episodes in the environments of a mask, bool ``[B]``; in all by default."""
+        """Begin new episodes in the environments of a mask, bool ``[B]``, or by default in all."""
         if mask is None:
             self._chunk = None
         elif self._chunk is not None:

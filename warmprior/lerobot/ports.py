@@ -1,4 +1,4 @@
-"""One small port per family of LeRobot's flow policies: where it draws its noise, and what replaces it."""
+"""One small port per family of LeRobot's flow policies, which replaces the noise that the family draws."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from torch.overrides import TorchFunctionMode
 from warmprior.modules.ode import Velocity
 
 Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
-"""``(shape [B, T, D], dtype, device) -> a_0``: replaces a draw."""
+"""A function ``(shape [B, T, D], dtype, device) -> a_0`` that replaces a draw."""
 
 
 class SourceInjection(TorchFunctionMode):
-    """Replaces the one draw by ``torch.randn`` or ``torch.randn_like`` of a chunk's shape, ``[B, T, D]``.
+    """A context that replaces the one draw by ``torch.randn`` or ``randn_like`` of shape ``[B, T, D]``.
 
-    A ``RuntimeError`` at the exit if there was not exactly one: the port is for another policy.
+    Raises RuntimeError at the exit unless there was exactly one, since the port is for another policy then.
 
     Examples:
         >>> import torch
@@ -49,7 +49,7 @@ class SourceInjection(TorchFunctionMode):
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        """Let all calls pass but the draw."""
+        """Let all calls pass except the draw."""
         kwargs = kwargs or {}
         if func is torch.randn:
             size = kwargs.get("size", args[0] if args and not isinstance(args[0], int) else args)
@@ -65,7 +65,7 @@ class SourceInjection(TorchFunctionMode):
         return self.source(torch.Size(size), dtype, torch.device(device))
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """Check the count, unless an error is under way."""
+        """Check the count, unless an error has been raised inside."""
         super().__exit__(kind, error, trace)
         if kind is None:
             length, width = self.expected
@@ -78,18 +78,18 @@ def _check_once(what: str, times: int) -> None:
 
 
 Record = Callable[[Tensor], None]
-"""Takes what a sampler returned, ``[B, T, >= d_a]``."""
+"""A function that receives a sampler's result, ``[B, T, >= d_a]``."""
 
 
 def check_no_noise(options: Mapping[str, Any]) -> None:
-    """Raise ValueError if a call gives the noise that the prior gives."""
+    """Raise ValueError if a call passes noise, which the prior already draws."""
     if options.get("noise") is not None:
-        raise ValueError("the prior gives noise=: leave it out, or leave out the second prior")
+        raise ValueError("the prior draws the noise: leave noise= out, or leave out the second prior")
 
 
 @contextmanager
 def _replaced(policy: Any, path: str, make: Callable[[Any], Any]) -> Iterator[None]:
-    """Inside, what a dotted path below a policy leads to is what ``make`` makes of it."""
+    """Replace the attribute at a dotted path below a policy by ``make(attribute)``, inside the context."""
     place, _, name = path.rpartition(".")
     owner = vars(attrgetter(place)(policy) if place else policy)
     before = owner.get(name, _replaced)  # a method lies in the class
@@ -104,23 +104,23 @@ def _replaced(policy: Any, path: str, make: Callable[[Any], Any]) -> Iterator[No
 
 
 def _around(policy: Any, path: str, call: Callable[..., Any]) -> AbstractContextManager[None]:
-    """Inside, ``call`` is called with a method, and its arguments, instead of the method."""
+    """Replace a method by a call of ``call`` with it and its arguments, inside the context."""
     return _replaced(policy, path, lambda method: wraps(method)(partial(call, method)))
 
 
 @dataclass(frozen=True)
 class FlowPort:
-    """Describes a family of policies: the chunk's shape, and where its noise is drawn.
+    """The port of a family of policies: the chunk's shape, and the place where its noise is drawn.
 
     Training and sampling run inside :meth:`training` and :meth:`sampling`, which check that the source is
-    used exactly once. Families that do not draw their noise by ``torch.randn`` in the loss and in the sampler
-    are subclasses.
+    used exactly once. Families that do not draw their noise with ``torch.randn`` in the loss and the sampler
+    have subclasses.
 
     Args:
-        chunk_length: where in a policy the length of the noisy chunk is, as a dotted path.
-        chunk_width: likewise its width.
-        sampler: likewise the method that samples a chunk.
-        steps: likewise the number of integration steps.
+        chunk_length: dotted path in a policy to the length of the noisy chunk.
+        chunk_width: dotted path to its width.
+        sampler: dotted path to the method that samples a chunk.
+        steps: dotted path to the number of integration steps.
 
     Examples:
         >>> from warmprior.lerobot import PORTS
@@ -137,31 +137,31 @@ class FlowPort:
     steps: str
 
     def length(self, policy: Any) -> int:
-        """``T``, the length of the noisy chunk."""
+        """Return ``T``, the length of the noisy chunk."""
         return int(attrgetter(self.chunk_length)(policy))
 
     def width(self, policy: Any) -> int:
-        """``D``, the width of the noisy chunk, with padding beyond the action's."""
+        """Return ``D``, the width of the noisy chunk, including padding beyond the action."""
         return int(attrgetter(self.chunk_width)(policy))
 
     def lead(self, policy: Any) -> int:
-        """Positions of the chunk that lie before the current step."""
+        """Return the number of the chunk's positions before the current step."""
         return 0
 
     def normalization(self, policy: Any) -> str | None:
-        """How the preprocessor normalises actions, by LeRobot's name: ``"MEAN_STD"``, ``"MIN_MAX"``."""
+        """Return LeRobot's name of the actions' normalisation, such as ``"MEAN_STD"`` or ``"MIN_MAX"``."""
         return getattr(policy.config.normalization_mapping.get("ACTION"), "value", None)
 
     def check(self, policy: Any) -> None:
         """Raise ValueError for an option that would make the source inexact."""
 
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
-        """Context of one ``policy.forward``, whose loss uses this source."""
+        """Return a context for one ``policy.forward``, whose loss uses this source."""
         return SourceInjection(self.length(policy), self.width(policy), source)
 
     @contextmanager
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """Context in which new chunks start from the source; ``record`` is called with each, padded."""
+        """Let new chunks start from the source, and call ``record`` with each, including its padding."""
 
         def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             output = self.sample(policy, source, sample, *args, **kwargs)
@@ -177,12 +177,12 @@ class FlowPort:
     def sample(
         self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Any:
-        """Call the policy's sampler, with its noise from the source."""
+        """Call the policy's sampler with noise from the source."""
         with SourceInjection(self.length(policy), self.width(policy), source):
             return sample(*args, **kwargs)
 
     def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
-        """Context in which ``guide`` changes the sampler's velocities, whose source is at time 0."""
+        """Return a context in which ``guide`` changes the sampler's velocities, with the source at time 0."""
         raise ValueError(f"guidance is for pi0, pi05 and smolvla: leave it out with {type(policy).__name__}")
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
@@ -191,7 +191,7 @@ class FlowPort:
 
 
 class OpenPiPort(FlowPort):
-    """For pi0, pi0.5 and SmolVLA, whose models take the noise as an argument (compiled ones too)."""
+    """The port of pi0, pi0.5 and SmolVLA, whose models, even compiled, take the noise as an argument."""
 
     def check(self, policy: Any) -> None:
         """Raise ValueError if actions are in another space than the model's."""
@@ -224,7 +224,7 @@ class OpenPiPort(FlowPort):
         return sample(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
 
     def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
-        """Guide velocities of the other sign: these families integrate from 1, the source, to 0."""
+        """Guide velocities with reversed sign: these families integrate from 1, the source, to 0."""
         rtc = getattr(policy.config, "rtc_config", None)
         if rtc is not None and rtc.enabled:
             raise ValueError("the policy's own rtc_config guides already: turn it off, or leave out guidance")
@@ -241,7 +241,7 @@ class OpenPiPort(FlowPort):
 
 
 class GrootPort(FlowPort):
-    """For GR00T N1.7."""
+    """The port of GR00T N1.7."""
 
     def check(self, policy: Any) -> None:
         """Raise ValueError for relative actions, which cannot be expressed at the next state from outside."""
@@ -252,7 +252,7 @@ class GrootPort(FlowPort):
 
 
 class GrootN15Port(FlowPort):
-    """For GR00T N1.5, which deviates from its configuration."""
+    """The port of GR00T N1.5, which deviates from its configuration."""
 
     def check(self, policy: Any) -> None:
         """Raise ValueError if the action head repeats each batch before it draws noise."""
@@ -261,7 +261,7 @@ class GrootN15Port(FlowPort):
             raise ValueError(f"expand_batch={copies} does not repeat the history: set it to None")
 
     def normalization(self, policy: Any) -> str:
-        """Return what its preprocessor does, whatever its ``normalization_mapping``."""
+        """Return the preprocessor's normalisation, which ignores ``normalization_mapping``."""
         return "MIN_MAX"
 
     @contextmanager
@@ -280,19 +280,19 @@ class GrootN15Port(FlowPort):
 
 
 class MultiTaskDiTPort(FlowPort):
-    """For multi_task_dit, whose chunk begins with the first of its observations."""
+    """The port of multi_task_dit, whose chunk begins at the first of its observations."""
 
     def lead(self, policy: Any) -> int:
         """Return the number of observations before the last one."""
         return policy.config.n_obs_steps - 1
 
     def check(self, policy: Any) -> None:
-        """Raise ValueError unless its objective is flow matching."""
+        """Raise ValueError unless the policy's objective is flow matching."""
         if policy.config.objective != "flow_matching":
-            raise ValueError(f"objective={policy.config.objective!r} is no flow: set 'flow_matching'")
+            raise ValueError(f"objective={policy.config.objective!r} is not a flow: set 'flow_matching'")
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
-        """Sample a chunk; its own ``predict_action_chunk`` takes the observations from its queue."""
+        """Sample a chunk without ``predict_action_chunk``, which takes observations from the queue."""
         policy.eval()
         if policy.config.n_obs_steps == 1:  # the queue adds a time dimension even to a single one
             inputs = policy.config.input_features
@@ -334,14 +334,14 @@ PORTS: dict[str, dict[str, FlowPort]] = {
         )
     },
 }
-"""By the release of LeRobot (``"0.6"`` is all of 0.6), and in it by LeRobot's name of the family.
+"""The ports by release of LeRobot (``"0.6"`` is all of 0.6), and by LeRobot's name of the family.
 
 ``"groot"`` is GR00T N1.7 in 0.6, and N1.5 in 0.5.1, whose other families are not supported.
 """
 
 
 def port_for(policy: Any) -> FlowPort:
-    """Return the port of a policy's family, or of a subclass, in the release of lerobot that is installed."""
+    """Return the port of a policy's family, or of its base class, in the installed release of lerobot."""
     installed = version("lerobot")
     ports = next((PORTS[release] for release in PORTS if f"{installed}.".startswith(f"{release}.")), None)
     supported = "; ".join(f"{release}: {', '.join(families)}" for release, families in PORTS.items())

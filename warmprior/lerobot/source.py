@@ -17,10 +17,10 @@ from warmprior.modules.prior import Prior, Source
 
 
 class ChunkSource:
-    """Draws ``a_0`` ``[B, T, D]`` for a chunk of ``lead`` past, ``P`` predicted and further positions.
+    """The source ``a_0`` ``[B, T, D]`` of a chunk with ``lead`` past, ``P`` predicted and further positions.
 
-    The prior gives the ``P`` positions from the current step on, in the ``d_a`` dimensions of the action. All
-    other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints. ``std`` as of
+    The prior draws the ``P`` positions from the current step on, in the ``d_a`` dimensions of the action. All
+    other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints. For ``std`` see
     :class:`~warmprior.lerobot.WarmPriorAdapter`.
     """
 
@@ -42,7 +42,7 @@ class ChunkSource:
         try:
             prior.distribution(cold_history([1], *self._lengths, self.action_dim, device=device))
         except Exception as error:
-            raise ValueError(f"{prior} needs more than the history, which LeRobot has: {error}") from error
+            raise ValueError(f"{prior} needs more than the history, the only input here: {error}") from error
         if std is not None:
             check_shape("std", std, (self.action_dim,))
             for value in std.tolist():
@@ -50,22 +50,22 @@ class ChunkSource:
 
     @property
     def positions(self) -> slice:
-        """The prior's ``P`` positions in the chunk."""
+        """The slice of the prior's ``P`` positions in the chunk."""
         return slice(self.lead, self.lead + self.prior.prediction_length)
 
     def distribution(self, history: TensorDictBase) -> Source:
-        """The prior's source, in units of its ``sigma``, at histories ``[*B]`` in the model's units."""
+        """Return the source, in units of ``sigma``, for histories ``[*B]`` in the model's units."""
         check_history(history, *self._lengths, self.prior)
         unit = self._unit(history["actions"])
         own = {name: history[name] / unit for name in ("actions", "forecast")}
         return self.prior.distribution(history.copy().update(own))
 
     def scaled(self, values: Tensor, warm: Tensor) -> Tensor:
-        """Values of the source ``[*B, P, d_a]``, where warm in units of ``sigma``, in the model's units."""
+        """Convert source values ``[*B, P, d_a]``, in units of ``sigma`` where warm, to the model's units."""
         return torch.where(warm, values * self._unit(values), values)
 
     def draw(self, history: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        """The prior's part of a source at a history, ``[*B, P, d_a]`` in the model's units."""
+        """Draw the prior's part of a source for a history, ``[*B, P, d_a]`` in the model's units."""
         source = self.distribution(history)
         return self.scaled(source.sample(generator), source.warm)
 
@@ -77,10 +77,10 @@ class ChunkSource:
         generator: torch.Generator | None = None,
         cold_probability: float = 0.0,
     ) -> Tensor:
-        """Source ``a_0`` ``[B, T, D]`` of training windows with this target, ``[B, T, >= d_a]``.
+        """Draw the source ``a_0`` ``[B, T, D]`` of training windows with this target, ``[B, T, >= d_a]``.
 
-        ``before`` are the prior's ``history_length`` actions before the current step, of which those that are
-        ``valid``, bool ``[B, *]``, lie in the episode.
+        ``before`` are the ``history_length`` actions before the current step; ``valid``, bool ``[B, *]``,
+        marks those inside the episode.
         """
         wanted = target[:, self.positions, : self.action_dim]
         executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
@@ -92,7 +92,7 @@ class ChunkSource:
         return self.place(self.draw(history, generator), generator)
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The whole source ``[B, T, D]``: the prior's part ``[B, P, d_a]``, and ``N(0, 1)`` elsewhere."""
+        """Return the whole source ``[B, T, D]``: the prior's part ``[B, P, d_a]``, ``N(0, 1)`` elsewhere."""
         whole = torch.randn(
             (len(a0), self.length, self.width), dtype=a0.dtype, device=a0.device, generator=generator
         )
@@ -105,13 +105,13 @@ class ChunkSource:
 
 
 def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Tensor:
-    """Standard deviation of a dataset's actions in the units of a LeRobot policy, ``[d_a]``.
+    """Return the standard deviation of a dataset's actions in the units of a LeRobot policy, ``[d_a]``.
 
-    The statistics are ``dataset.meta.stats``.
+    Pass ``dataset.meta.stats`` as statistics.
 
     Raises:
         ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions
-            elsewhere, or it has no port.
+            in another way, or it has no port.
 
     Examples:
         >>> from warmprior.lerobot import action_std

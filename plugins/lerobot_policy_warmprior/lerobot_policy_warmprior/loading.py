@@ -31,7 +31,7 @@ STATISTICS = {
 
 
 def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
-    """What a JSON file of a folder, or of a repository of the hub, holds; empty if there is none."""
+    """Return the content of a JSON file in a folder or hub repository, empty if there is none."""
     folder = Path(place)
     try:
         file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, **hub))

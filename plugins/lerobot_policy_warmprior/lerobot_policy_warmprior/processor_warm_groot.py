@@ -55,7 +55,7 @@ class WarmGrootPackInputsStep(GrootN17PackInputsStep):
         return packed
 
     def get_config(self) -> dict[str, Any]:
-        """What is saved."""
+        """Return the arguments that are saved."""
         return super().get_config() | {"history_length": self.history_length}
 
 
