@@ -121,10 +121,10 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
         (["evaluate", str(saved[0]), "--import", "no.such"], "No module named 'no'"),
         (["info", str(tmp_path / "missing")], "no policy at"),
-        (["info", __file__], "it is a file, and a policy is a folder"),
+        (["info", __file__], "it is a file"),
         (["info", str(tmp_path)], "it holds the policies bare: name one of them"),
         (["train", str(tmp_path)], f"is a folder: name a file, or a LeRobotDataset as lerobot:{tmp_path}"),
-        (["push", str(bare), "name", "--dry-run"], "'name' is no name of a repository"),
+        (["push", str(bare), "name", "--dry-run"], "'name' is not the name of a repository"),
         (["evaluate", str(saved[0]), "--video", "out.txt"], "out.txt must end in .mp4"),
     ):
         assert main(argv) == 2

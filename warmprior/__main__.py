@@ -67,7 +67,7 @@ def evaluate(args: argparse.Namespace) -> None:
     nfes = [actor.sampling.evaluations(nfe) for nfe in args.nfe or [None]]
     if args.grid is not None:
         actor = actor.replace(grid=args.grid)
-    if args.video is not None:  # known now rather than after the episodes
+    if args.video is not None:  # before the episodes are played
         check_video(args.video)
     options = {"terminate_on_success": not args.play_on}
     env = environment_of(actor, **options)
@@ -107,12 +107,12 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def push(args: argparse.Namespace) -> None:
-    """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
+    """Send a saved policy to the Hugging Face hub, with a model card."""
     from warmprior.training.card import model_card
     from warmprior.training.saved import check_repository, push_policy
 
     check_repository(args.repository)
-    branch, args.revision = args.revision, None  # of the repository, not of the folder
+    branch, args.revision = args.revision, None  # the revision is the repository's, not the folder's
     if not Path(args.folder).is_dir():
         raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")
     actor = _policy(args)
@@ -138,24 +138,25 @@ class Train:
     Attributes:
         network: the velocity network.
         training: the recipe.
-        prior: its source (gaussian, past, preview, or package.module:Class of your own); options follow as in
+        prior: the source (gaussian, past, preview, or package.module:Class of your own); options follow as in
             past,sigma=0.3.
         chunk: chunk length H.
         nfe: network evaluations per chunk, saved with the policy.
-        observation_keys: what policies see, in this order (default: the task's).
-        joint_key: of these the one that actions are absolute targets of, such as observation.state.
-        image_keys: images that they see, beside the robot's state, such as agentview_image.
-        fast_rendering: whether robosuite's images are without reflections, shadows and smooth edges.
-        actions: what policies predict: as recorded, or the absolute poses that robosuite's deltas ask for.
+        observation_keys: observations that policies see, in this order (default: the task's).
+        joint_key: the observation whose numbers the actions set, such as observation.state.
+        image_keys: images that they see, in addition to the robot's state, such as agentview_image.
+        fast_rendering: robosuite's images have no reflections, shadows and smooth edges.
+        actions: the policies' actions: as recorded, or the absolute poses that robosuite's deltas target.
         mask: a mask of the file, such as train.
-        demonstrations: how many, from the first on (default: all).
-        held_out: how many of the last ones to leave out, and to measure the error of actions on (default: a
-            tenth where no environment is known, none elsewhere).
-        task: of robosuite, for a LeRobotDataset that does not describe its environment.
-        style: of the demonstrations, which decides robosuite's time limit (default: ph, and human elsewhere).
+        demonstrations: number of demonstrations, from the first on (default: all).
+        held_out: number of last demonstrations to leave out, and to measure the error of actions on (default:
+            a tenth if no environment is known, else none).
+        task: task of robosuite, for a LeRobotDataset that does not describe its environment.
+        style: style of the demonstrations, which decides robosuite's time limit (default: ph, and human
+            outside robosuite).
         horizon: control steps per episode (default: the environment's own, or robosuite's for the style).
         out: folder of the trainings (default: policies); an interrupted one continues.
-        device: of the network, such as cuda.
+        device: device of the network, such as cuda.
     """
 
     network: NetworkOptions
@@ -179,7 +180,7 @@ class Train:
 
 
 def train(args: argparse.Namespace) -> None:
-    """Train a policy on demonstrations, and play nothing."""
+    """Train a policy on demonstrations, without playing episodes."""
     import tyro
 
     place, *rest = args.options or [""]
@@ -212,9 +213,9 @@ def train(args: argparse.Namespace) -> None:
     )
     if whole.environment is not None:
         try:
-            whole.check_environment()  # which is better known before the training
+            whole.check_environment()  # an error is better raised before the training
         except ImportError as missing:
-            print(f"the training goes on, and nothing can be played here: {missing}")
+            print(f"the training goes on, but no episodes can be played here: {missing}")
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
     task, left_out = whole.split(tenth if options.held_out is None else options.held_out)
@@ -275,7 +276,7 @@ def observe(args: argparse.Namespace) -> None:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The commands and their options."""
+    """Return the parser of the commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
     written = f"warmprior {version('warmprior')}"
     parser.add_argument("--version", action="version", version=written, help="print it, and end")
@@ -346,9 +347,9 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command line, without the program; the exit code. What a user can mend is said in one line."""
+    """Run command-line arguments, and return the exit code. User errors are reported in one line."""
     args = make_parser().parse_args(argv)
-    # What cannot be rendered, or generated, here is a RuntimeError.
+    # A machine that cannot render or generate data raises a RuntimeError.
     return run_script(lambda: args.run(args), "warmprior", errors=(*ERRORS, RuntimeError))
 
 

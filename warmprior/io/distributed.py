@@ -23,18 +23,18 @@ _waiting: dist.ProcessGroup | None = None
 
 
 def launched() -> bool:
-    """Whether ``torchrun`` started this process as one of several."""
+    """Return True if ``torchrun`` started this process as one of several."""
     names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR")
     return all(name in os.environ for name in names) and int(os.environ["WORLD_SIZE"]) > 1
 
 
 def world_size() -> int:
-    """How many processes train together: 1 unless this one has :func:`joined` others."""
+    """Return the number of processes that train together: 1 unless this one has :func:`joined` others."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def rank() -> int:
-    """The number of this process among them. The first, 0, is the leader: it alone writes and prints."""
+    """Return this process's number. Process 0 is the leader: only it writes and prints."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 

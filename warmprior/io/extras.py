@@ -8,7 +8,7 @@ from types import ModuleType
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or say in an ``ImportError`` which extra of this package provides it.
+    """Import an optional module, or raise ImportError with the extra of this package that provides it.
 
     It is looked up before, so an error *inside* an installed module is not mistaken for a missing one.
 

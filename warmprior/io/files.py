@@ -41,7 +41,7 @@ def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] |
 
 
 def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and metadata of a safetensors file, from its bytes.
+    """Return the tensors and metadata of a safetensors file, from its bytes.
 
     The format's own reader opens a path twice, and may find another file the second time.
     """
@@ -52,7 +52,7 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def is_repository(name: str) -> bool:
-    """Whether a text has the form of a repository's name at the hub, ``user/name``.
+    """Return True if a text has the form of a repository's name on the hub, ``user/name``.
 
     Examples:
         >>> from warmprior.io.files import is_repository
@@ -72,23 +72,23 @@ def check_regular(path: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content."""
+    """Return the SHA-256 of a file's content."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_of(*parts: Any) -> str:
-    """SHA-256 of values that JSON can hold: the identity of what they determine."""
+    """Return the SHA-256 of values that JSON can hold."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def as_json(value: Any) -> Any:
-    """What is read back after writing a value as JSON: tuples become lists, keys text."""
+    """Return a value as JSON reads it back: tuples become lists, and keys text."""
     return json.loads(json.dumps(value))
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; a ``ValueError`` that names it if it is none."""
+    """Read a JSON file; raise ValueError with its name if it is invalid."""
     check_regular(path)
     if path.stat().st_size > JSON_BYTES:
         raise ValueError(f"{path} is not valid JSON of this library: it has {path.stat().st_size} bytes")

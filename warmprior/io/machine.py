@@ -1,4 +1,4 @@
-"""How much of this machine's memory is free."""
+"""The free memory of this machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Bytes that can be taken before the system, or this process's container, runs out."""
+    """Return the bytes that can be allocated before the system, or this process's container, runs out."""
     free = int(psutil.virtual_memory().available)
     # psutil does not know the limit of a container. There is none where these are missing or say "max".
     with contextlib.suppress(OSError, ValueError):

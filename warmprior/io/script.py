@@ -43,8 +43,8 @@ def run_script(
         train.py: error: invalid literal for int() with base 10: 'eight'
         2
     """
-    # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
-    # a second thread, and on a busy machine threads that wait for each other cost much.
+    # Policies are shared between scripts, so all of them use the same precision and threads. Small networks
+    # are no faster with a second thread, and on a busy machine threads that wait for each other cost much.
     torch.set_float32_matmul_precision("high")
     torch.set_num_threads(1)
     interrupted = False

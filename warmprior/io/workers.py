@@ -28,16 +28,16 @@ class WorkerError(RuntimeError):
 
 
 def worker_died(worker: str, advice: str) -> WorkerError:
-    """The error that tells which worker died, the likely reason, and what to do."""
+    """Return the error with the worker that died, the likely reason, and advice."""
     return WorkerError(
         f"{worker} died. It may have been killed for lack of memory; use fewer workers, or {advice}."
     )
 
 
 def start_method() -> str:
-    """How to start workers: forking takes a second instead of a minute.
+    """Return the method to start workers: forking, which takes a second instead of a minute, if possible.
 
-    But autograd refuses to work in a fork of a process that used it where a GPU is in sight.
+    Autograd does not work in a fork of a process that used it if there is a GPU.
     """
     if not _forks or torch.cuda.is_available():
         return "spawn"
