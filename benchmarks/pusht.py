@@ -50,7 +50,7 @@ def task(options: DataOptions, relative: bool = False) -> Task:
     steps = lerobot_steps(place, OBSERVATION, demos=options.first("human"))
     if relative:
         steps["action"] = steps["action"] - steps["observation"][:, :2]
-    ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "film_rate": 10}
+    ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "video_rate": 10}
     style = "relative" if relative else "human"
     return Task.of("pusht", steps, partial(make_env, relative), style=style, **ends)
 

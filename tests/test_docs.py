@@ -202,9 +202,9 @@ def test_built_reference_shows_the_type_of_every_parameter(built):
 
 
 @pytest.mark.slow
-def test_built_docs_are_small_and_hold_the_films(built):
+def test_built_docs_are_small_and_hold_the_videos(built):
     assert sum(path.stat().st_size for path in built.rglob("*") if path.is_file()) < 30_000_000
     notebooks = {path.stem for path in (built / "_downloads").rglob("*.ipynb")}
     assert notebooks == {path.stem for path in (DOCS / "tutorials").glob("plot_*.py")}
-    films = re.findall(r'<video[^>]* src="([^"#]+)', (built / "gallery.html").read_text())
-    assert films and all((built / film).is_file() for film in films)
+    videos = re.findall(r'<video[^>]* src="([^"#]+)', (built / "gallery.html").read_text())
+    assert videos and all((built / video).is_file() for video in videos)

@@ -59,10 +59,10 @@ def test_evaluate_plays_the_same_episodes(saved, capsys):
 def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     av = pytest.importorskip("av")
     folder, episode = saved
-    film = tmp_path / "films" / "out.mp4"
-    argv = ["evaluate", str(folder), "--episodes", "1", "--nfe", "1", "--video", str(film)]
+    video = tmp_path / "videos" / "out.mp4"
+    argv = ["evaluate", str(folder), "--episodes", "1", "--nfe", "1", "--video", str(video)]
     assert apart(main)(argv) == 0
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert container.streams.video[0].average_rate == 20
     assert len(frames) == episode.steps + 1

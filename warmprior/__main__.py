@@ -59,7 +59,7 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.film import check_video, record_filmstrip
+    from warmprior.training.video import check_video, record_filmstrip
 
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
@@ -93,7 +93,7 @@ def evaluate(args: argparse.Namespace) -> None:
     finally:
         env.close()
     if args.video is not None:
-        film = record_filmstrip(
+        video = record_filmstrip(
             actor,
             seed=args.first_seed,
             nfe=nfes[-1],
@@ -103,7 +103,7 @@ def evaluate(args: argparse.Namespace) -> None:
             video=args.video,
             **options,
         )
-        print(f"{args.video}: episode {args.first_seed}, {'' if film.success else 'not '}solved")
+        print(f"{args.video}: episode {args.first_seed}, {'' if video.success else 'not '}solved")
 
 
 def push(args: argparse.Namespace) -> None:

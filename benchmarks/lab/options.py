@@ -114,7 +114,7 @@ class Run:
     resume: bool = False  # continue in --out, or in the latest default folder, with the options stored there
     envs: int | None = None  # worker processes, with the same results (default: one per core)
     device: str = "cpu"  # of networks and data, such as cuda; under torchrun each process takes its own
-    films: bool = True  # save a film and a filmstrip of one episode per method, which takes time
+    videos: bool = True  # save a video and a filmstrip of one episode per method, which takes time
     compile: bool = False  # torch.compile the network in training
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"  # of the training curves
     engine: Literal["local", "ray"] = "local"  # where jobs run: processes of this machine, or a Ray cluster
@@ -405,7 +405,7 @@ def output_folder(options: Options, study: str) -> Path:
     return out
 
 
-OF_A_START = ("out", "resume", "envs", "films", "logger", "engine", "ray_address")
+OF_A_START = ("out", "resume", "envs", "videos", "logger", "engine", "ray_address")
 """Options of a run that may differ each time it is started: they change no result."""
 
 

@@ -45,7 +45,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         fewest = fewest[fewest.temperature == fewest.groupby("method").temperature.transform("max")]
         plot_learning_curves(losses, fewest, out / f"learning_curves{end}.png", title=title)
         task = played[0].task()
-        if not options.run.films:
+        if not options.run.videos:
             continue
         drawn = task.environment is not None  # of robosuite or Gymnasium
         if drawn and rendering_backend() is None:
@@ -53,19 +53,19 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
                 "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "
                 "apt-get install libegl1 libegl-mesa0 (or libosmesa6)."
             )
-        elif drawn or task.film_rate is not None:
+        elif drawn or task.video_rate is not None:
             for method, policy in {label[p.name]: p for p in reversed(played)}.items():
-                film(options, policy, method, end)
+                video(options, policy, method, end)
 
 
-def film(options: Options, policy: Policy, method: str, end: str) -> None:
-    """The first evaluation episode of a policy, in pictures and, with PyAV, as a film."""
+def video(options: Options, policy: Policy, method: str, end: str) -> None:
+    """The first evaluation episode of a policy, in pictures and, with PyAV, as a video."""
     nfe, task = min(policy.method.nfes(options.evaluation.nfe)), policy.task()
     slug = re.sub(r"[^\w.]+", "-", method if "," in method else policy.method.name)
-    video = options.run.folder / f"film_{slug}{end}.mp4"
+    video = options.run.folder / f"video_{slug}{end}.mp4"
     own: dict[str, Any] = options.evaluation.environment
     if task.environment is None:
-        own = {"env": task.env(policy.load()), "rate": task.film_rate, "success": task.success}
+        own = {"env": task.env(policy.load()), "rate": task.video_rate, "success": task.success}
     strip = record_filmstrip(
         policy.load(),
         seed=EVALUATION_SEED,

@@ -1,9 +1,9 @@
-"""Puts pictures and films of runs on the gallery's page: small files that look the same.
+"""Puts pictures and videos of runs on the gallery's page: small files that look the same.
 
 python docs/figures/gallery.py runs/budget/budget.png              # the name is that in docs/_static/gallery
 python docs/figures/gallery.py runs/can-ph-quick/success.png success_can.png
 
-Pictures get at most 1400 pixels in width and a palette of 256 colours. Films stay as they are, but for the
+Pictures get at most 1400 pixels in width and a palette of 256 colours. Videos stay as they are, but for the
 index, which goes to the front: browsers begin to play before they have all of it (needs PyAV).
 """
 
@@ -37,7 +37,7 @@ def reduce_picture(source: Path, target: Path) -> None:
     reduced.save(target, optimize=True)
 
 
-def copy_film(source: Path, target: Path) -> None:
+def copy_video(source: Path, target: Path) -> None:
     """Write the same frames with the index in front."""
     av = require("av", "lerobot")
     options = {"movflags": "faststart"}
@@ -54,7 +54,7 @@ def main(source: str, name: str | None = None) -> None:
     path = Path(source)
     target = OUT / (name or path.name)
     OUT.mkdir(exist_ok=True)
-    (copy_film if path.suffix == ".mp4" else reduce_picture)(path, target)
+    (copy_video if path.suffix == ".mp4" else reduce_picture)(path, target)
     print(f"{target}: {target.stat().st_size:,} bytes, of {path.stat().st_size:,}")
 
 

@@ -1,8 +1,8 @@
-"""One GIF from several films of the same episode, each under its name.
+"""One GIF from several videos of the same episode, each under its name.
 
 python docs/figures/side_by_side.py docs/_static/door.gif "Gaussian source=gaussian.mp4" "WP-Past=past.mp4"
 
-It plays at a third of the speed. A film that ends before the others stays at its last picture.
+It plays at a third of the speed. A video that ends before the others stays at its last picture.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ BAR = 30  # height of the names, in pixels
 
 
 def pictures(path: Path) -> list[Image.Image]:
-    """The film, slowed down, at :data:`RATE` pictures per second."""
+    """The video, slowed down, at :data:`RATE` pictures per second."""
     av = require("av", "lerobot")
-    with av.open(str(path)) as film:
-        rate = float(film.streams.video[0].average_rate)
-        frames = [frame.to_image() for frame in film.decode(video=0)]
-    step = rate / SLOWER / RATE  # frames of the film per picture
+    with av.open(str(path)) as video:
+        rate = float(video.streams.video[0].average_rate)
+        frames = [frame.to_image() for frame in video.decode(video=0)]
+    step = rate / SLOWER / RATE  # frames of the video per picture
     return [frames[min(round(k * step), len(frames) - 1)] for k in range(int(len(frames) / step) + 1)]
 
 
-def main(out: str, *films: str) -> None:
+def main(out: str, *videos: str) -> None:
     """Write the GIF."""
-    names = [film.split("=")[0] for film in films]
-    columns = [pictures(Path(film.split("=", 1)[1])) for film in films]
+    names = [video.split("=")[0] for video in videos]
+    columns = [pictures(Path(video.split("=", 1)[1])) for video in videos]
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 15)
     side, length = columns[0][0].width, max(map(len, columns))
     joined = []
     for k in range(length):
-        page = Image.new("RGB", (side * len(films), side + BAR), "white")
+        page = Image.new("RGB", (side * len(videos), side + BAR), "white")
         draw = ImageDraw.Draw(page)
         for column, (name, frames) in enumerate(zip(names, columns, strict=True)):
             page.paste(frames[min(k, len(frames) - 1)], (column * side, BAR))

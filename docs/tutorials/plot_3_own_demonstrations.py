@@ -189,7 +189,7 @@ policies = {
 # ----------
 # :func:`~warmprior.training.evaluate` plays the episodes of given seeds, the same ones for every
 # policy. It needs one entry that Gymnasium's pendulum lacks: ``"success"``. A small transform adds
-# it: the pendulum stands when the time is over. It also keeps the observations, for the film below;
+# it: the pendulum stands when the time is over. It also keeps the observations, for the video below;
 # transforms before :func:`~warmprior.policy_transforms` see every
 # control step.
 
@@ -264,15 +264,15 @@ plt.show()
 # upright differs by several by chance alone: for a comparison take more of them, and several
 # training seeds.)
 #
-# A film
+# A video
 # ------
 # One episode of WP-Past, from a start that no demonstration has. (Tasks of robosuite have
 # :func:`~warmprior.training.record_filmstrip`, which renders the simulator; for an environment of your
 # own, draw its observations.)
 
 
-class Film:
-    """Pictures that pages and notebooks show as a film."""
+class Video:
+    """Pictures that pages and notebooks show as a video."""
 
     def __init__(self, pictures, rate):
         self.pictures, self.rate = pictures, rate
@@ -289,7 +289,7 @@ class Film:
             loop=0,
         )
         data = base64.b64encode(file.getvalue()).decode()
-        return f'<img alt="film of an episode" src="data:image/webp;base64,{data}">'
+        return f'<img alt="video of an episode" src="data:image/webp;base64,{data}">'
 
 
 def picture(observation, size=200):
@@ -308,7 +308,7 @@ _, seen = shown["WP-Past"]
 hardest = int(
     angle(seen[:, 0]).abs().argmax()
 )  # it starts nearest to hanging down
-Film([picture(observation) for observation in seen[hardest, ::2]], rate=10)
+Video([picture(observation) for observation in seen[hardest, ::2]], rate=10)
 
 # %%
 # The same episode as pictures, one per second:

@@ -33,7 +33,7 @@ class Inline:
 
 @pytest.fixture(scope="module", autouse=True)
 def inline(request):
-    """Jobs are computed here, and nothing is filmed, unless a test asks for it."""
+    """Jobs are computed here, and no video is made, unless a test asks for it."""
     if find_spec("tyro") is None or request.path.name == "test_jobs.py":
         yield
         return

@@ -80,7 +80,7 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
 
     def launch(out):
         few = {"iterations": 600, "save_every": 20, "checkpoints": 2, "episodes": 2, "prior": "past"}
-        argv = [*options(dataset, out, **few), "--no-films"]
+        argv = [*options(dataset, out, **few), "--no-videos"]
         argv += ["--resume"] if (out / "options.json").exists() else []
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         return subprocess.Popen([sys.executable, robomimic.__file__, *argv], start_new_session=True, **quiet)

@@ -4,13 +4,13 @@ from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.card import model_card
 from warmprior.training.evaluation import Episode, evaluate, play_episode
-from warmprior.training.film import Filmstrip, record_filmstrip
 from warmprior.training.optim import ema_of, warmup_cosine
 from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.parallel import parallel_env
 from warmprior.training.saved import load_policy, push_policy, save_policy
 from warmprior.training.task import Task
 from warmprior.training.train import precondition, train_policy
+from warmprior.training.video import Filmstrip, record_filmstrip
 
 __all__ = [
     "BehaviourCloning",

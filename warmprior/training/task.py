@@ -46,8 +46,9 @@ class Task:
         success: the environment's key of a flag that is True once the task is solved, bool ``[1]``.
         measures: further keys that episodes report, each with the way in which its values are combined:
             ``"max"``, ``"sum"`` or ``"last"``.
-        film_rate: control steps per second of videos. The environment then needs a method ``render`` that
-            returns a picture, uint8 ``[h, w, 3]``. ``None`` for no videos, except with robosuite.
+        video_rate: control steps per second of videos. The environment then needs a method ``render`` that
+            returns a picture, uint8 ``[h, w, 3]``. ``None`` for no videos, except with environments that are
+            opened by name.
         facts: facts about the data for results, as JSON.
         adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
@@ -80,7 +81,7 @@ class Task:
     normalizer: Normalizer | None = None
     success: NestedKey = SUCCESS
     measures: Mapping[str, Literal["max", "sum", "last"]] = field(default_factory=dict)
-    film_rate: int | None = None
+    video_rate: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     adapters: Mapping[str, Transform] = field(default_factory=dict)
     rest: RestingAction | None = None
@@ -105,7 +106,7 @@ class Task:
         style: str = "human",
         success: NestedKey = SUCCESS,
         measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
-        film_rate: int | None = None,
+        video_rate: int | None = None,
     ) -> Self:
         """Build a task from raw demonstrations; the normaliser is fitted to them.
 
@@ -150,7 +151,7 @@ class Task:
             normalizer,
             success=success,
             measures=measures or {},
-            film_rate=film_rate,
+            video_rate=video_rate,
             facts={"demonstrations": len(data[EPISODE].unique()), "steps": len(data)},
             clip=1.0,
         )
@@ -197,7 +198,7 @@ class Task:
             mask: a mask of the file, such as ``"train"``.
             demos: number of demonstrations to take, from the first on; all by default.
             horizon: control steps per episode; by default the environment's own, or that of the style.
-            **outcome: ``success``, ``measures`` and ``film_rate``, only with a ``make_env``, see :meth:`of`.
+            **outcome: ``success``, ``measures`` and ``video_rate``, only with a ``make_env``, see :meth:`of`.
 
         Raises:
             FileNotFoundError: if there is no such file or dataset.

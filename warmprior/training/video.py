@@ -64,7 +64,7 @@ def _picture(env: Any) -> np.ndarray:
     if picture is None:
         raise ValueError(
             "the environment draws no pictures: make it with render_mode='rgb_array', or request no videos "
-            "(film_rate=None)"
+            "(video_rate=None)"
         )
     return picture
 
@@ -133,7 +133,7 @@ def record_filmstrip(
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_filmstrip(actor, seed=10_000_000, nfe=1, frames=5).steps  # doctest: +SKIP
         [0, 24, 48, 71, 95]
-        >>> record_filmstrip(actor=None, seed=0, size=161, video=Path("film.mp4"))
+        >>> record_filmstrip(actor=None, seed=0, size=161, video=Path("video.mp4"))
         Traceback (most recent call last):
             ...
         ValueError: the side of a video must be an even number of pixels, got 161

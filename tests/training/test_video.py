@@ -63,18 +63,18 @@ class DrawnDial(Dial):
         return np.full((8, 8, 3), self.turns, np.uint8)
 
 
-def test_a_policy_of_gymnasium_is_filmed_by_its_environment(tmp_path, monkeypatch):
+def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypatch):
     gymnasium.register("DrawnDial-v0", DrawnDial, max_episode_steps=4)
     monkeypatch.setitem(gymnasium.registry, "DrawnDial-v0", gymnasium.registry.pop("DrawnDial-v0"))
     recorded = {"id": "DrawnDial-v0", "kwargs": {"render_mode": "human"}, "max_episode_steps": 4}
     described = registered_description({**recorded, "success": "solved", "observation_keys": []}, 1)
     network = VelocityMLP(1, 2, 2, observation_steps=1, hidden_dim=16)
     actor = WarmPriorActor(network, GaussianPrior(2), clip=1.0, environment=described)
-    film = tmp_path / "film.mp4"
-    strip = record_filmstrip(actor, seed=0, frames=9, size=16, video=film, terminate_on_success=False)
+    video = tmp_path / "video.mp4"
+    strip = record_filmstrip(actor, seed=0, frames=9, size=16, video=video, terminate_on_success=False)
     assert [int(frame[0, 0, 0]) for frame in strip.frames] == strip.steps == [0, 1, 2, 3, 4]
     av = pytest.importorskip("av")
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         stream = container.streams.video[0]
         assert (stream.average_rate, stream.frames) == (5, 5)
     bare = environment_of(actor)
