@@ -176,7 +176,10 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
     last = policies[0].training.iterations
     cells: dict[tuple[Policy, Cell], list[Any]] = {
-        (p, Cell(last, nfe)): [] for p in policies for nfe in p.method.nfes(options.evaluation.nfe)
+        (p, Cell(last, nfe, temperature=temperature)): []
+        for p in policies
+        for nfe in p.method.nfes(options.evaluation.nfe)
+        for temperature in p.method.temperatures(options.evaluation.temperature)
     }
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + options.evaluation.episodes)
     with Jobs(options.run) as jobs:
@@ -186,7 +189,7 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
             jobs.submit(f"play {policy}, {cell}, from {few[0]}", *work, then=episodes.extend)
         if failures := jobs.wait():
             raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
-    kept = ("prior", "nfe", "episodes", "successes", "mean_steps")
+    kept = ("prior", "nfe", "temperature", "episodes", "successes", "mean_steps")
     rows = (row(policy, cell, episodes, {}) for (policy, cell), episodes in cells.items())
     played = [{name: each[name] for name in kept} for each in rows]
     return {"trained": [told(policy) for policy in policies], "played": played}
@@ -227,7 +230,8 @@ def main(argv: list[str] | None) -> None:
     for number in parts:
         work, minutes = PARTS[number]
         mine, name = {"part": number, **identity}, f"part {number}, {work.__name__}"
-        done = any(mine.items() <= found.items() for found in rows)
+        known = any(mine.items() <= found.items() for found in rows)
+        done = known and not identity["commit"].endswith("-dirty")
         print(f"{name}: done before" if done else name, flush=True)
         if done:
             continue

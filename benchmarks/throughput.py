@@ -172,7 +172,7 @@ def lacks(device: str) -> bool:
     """Say that a figure is left out, where it needs a GPU and there is none."""
     if device == "cpu" or torch.cuda.is_available():
         return False
-    tqdm.write("skipped, needs a GPU")
+    tqdm.write(f"a figure on {device}: skipped, needs a GPU")
     return True
 
 
@@ -269,6 +269,7 @@ def _passes(network: nn.Module, inputs: tuple[torch.Tensor, ...], nfe: int) -> N
         network(*inputs)
 
 
+@torch.no_grad()
 def actor_over_network(clock: Clock) -> dict[str, float]:
     network = paper_network().eval()
     actor = WarmPriorActor(network, PRIOR).eval()

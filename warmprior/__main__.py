@@ -68,7 +68,7 @@ def evaluate(args: argparse.Namespace) -> None:
     if args.grid is not None:
         actor = actor.replace(grid=args.grid)
     if args.video is not None:  # before the episodes are played
-        check_video(args.video)
+        check_video(args.video, actor)
     options = {"terminate_on_success": not args.play_on}
     env = environment_of(actor, **options)
     try:

@@ -148,8 +148,8 @@ def readme_table() -> str:
         for nfe in (9, 3, 1):
             rates = rows[rows["nfe"] == nfe].set_index("source")["success"].reindex(sources)
             if rates.notna().any():
-                most = rates.round().max()
-                cells = [f"**{n:.0f}**" if n == most else f"{n:.0f}" for n in (rates + 1e-6).round()]
+                rounded = (rates + 1e-6).round()
+                cells = [f"**{n:.0f}**" if n == rounded.max() else f"{n:.0f}" for n in rounded]
                 text.append(f"| {name} | {nfe} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 

@@ -181,12 +181,14 @@ def record_filmstrip(
     return Filmstrip(pictures, steps.tolist(), played.success)
 
 
-def check_video(path: Path) -> None:
+def check_video(path: Path, actor: WarmPriorActor) -> None:
     """Raise an error, before any episode, if a video could not be written or does not end in .mp4."""
+    from warmprior.envs.description import is_registered
     from warmprior.envs.rendering import require_rendering
 
     if path.suffix != ".mp4":
         raise ValueError(f"{path} must end in .mp4: videos have no other format")
     require("av", "lerobot")
-    require_rendering()
+    if not is_registered(actor.environment):  # Gymnasium's environments draw by themselves
+        require_rendering()
     check_writable(path.parent)
