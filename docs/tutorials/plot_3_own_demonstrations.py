@@ -265,7 +265,7 @@ plt.show()
 # training seeds.)
 #
 # A video
-# ------
+# -------
 # One episode of WP-Past, from a start that no demonstration has. (Tasks of robosuite have
 # :func:`~warmprior.training.record_filmstrip`, which renders the simulator; for an environment of your
 # own, draw its observations.)
