@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lab.options import script
+from lab.command_line import script
 from lab.report import policy_results
 from warmprior.training import load_policy, model_card
 

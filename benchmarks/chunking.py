@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import sys
 
+from lab.command_line import parse, script, started
 from lab.comparison import compare
-from lab.options import PRESETS, check_single, parse, script, started, with_parts
+from lab.options import check_single, with_parts
 from lab.paper import PAPER_CHUNK
 from lab.plots import plot_bars, plot_lines, plot_success
 from lab.policies import policies_of, slug
+from lab.presets import PRESETS
 from lab.report import at_fewest, labelled, per_seed, table, write_report
 
 JUMPS = ("boundary_jump", "inner_jump")

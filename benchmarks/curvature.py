@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import torch
 
+from lab.command_line import parse, script, started
 from lab.comparison import train_all
 from lab.measures import RATIOS, held_out, straightness
-from lab.options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
+from lab.options import FinishedRun, MeasuredOptions
 from lab.paper import paper_curvature
 from lab.plots import plot_flow_paths
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
+from lab.presets import PRESETS, study
 from lab.report import labelled, pooled, setting_title, table, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
 

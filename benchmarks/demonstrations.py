@@ -11,8 +11,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lab.command_line import script
 from lab.downloads import OFFICIAL, download_robomimic
-from lab.options import script
 from lab.render import render_demonstrations
 from lab.scripted.generate import generate_demonstrations
 from lab.scripted.tasks import EXPERTS

@@ -25,12 +25,14 @@ from xml.etree import ElementTree
 import throughput
 from tqdm import tqdm
 
+from lab.command_line import read, script
 from lab.comparison import EPISODES_PER_JOB, train_all
 from lab.files import ERRORS, PartialFailure, read_lines
 from lab.jobs import Jobs
 from lab.machine import check_device, facts_of_machine
-from lab.options import PRESETS, Options, adapted, check_given, read, script, with_parts
+from lab.options import Options, check_given, with_parts
 from lab.policies import Cell, Policy, play, policies_of, row
+from lab.presets import PRESETS, adapted
 from lab.tasks import check_counts
 from lab.timing import Clock
 from warmprior.checks import check_choice, check_positive
@@ -45,7 +47,7 @@ BEFORE_PLAYING, ALONE = 0.75, 0.9
 """Shares of a part's time that its trainings take."""
 
 DEMONSTRATIONS = {"state": 100, "image": 6}
-"""Of six operators; with their images they take less than 60 MiB."""
+"""The numbers of demonstrations to make; with their images they take less than 60 MiB."""
 
 SMALLEST: dict[str, dict[str, Any]] = {
     "data": {"demonstrations": (3,), "image_size": 32, "fast_rendering": True},
@@ -164,8 +166,8 @@ def iterations_per_second(policy: Policy) -> float:
     return statistics.median(float(line.split(",")[1]) for line in path.read_text().splitlines()[1:])
 
 
-def told(policy: Policy) -> dict[str, Any]:
-    """Return what a training came to."""
+def training_facts(policy: Policy) -> dict[str, Any]:
+    """Return the speed and losses of a training, with the policy's facts."""
     (_, first), *_, (_, last) = policy.losses
     found = {"iterations_per_second": iterations_per_second(policy), "first_loss": first, "loss": last}
     return {**policy.facts, "batch_size": policy.training.batch_size, **found}
@@ -192,12 +194,12 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     kept = ("prior", "nfe", "temperature", "episodes", "successes", "mean_steps")
     rows = (row(policy, cell, episodes, {}) for (policy, cell), episodes in cells.items())
     played = [{name: each[name] for name in kept} for each in rows]
-    return {"trained": [told(policy) for policy in policies], "played": played}
+    return {"trained": [training_facts(policy) for policy in policies], "played": played}
 
 
 def images(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Train from the images of two cameras."""
-    return {"trained": [told(policy) for policy in train_for(o, ALONE * seconds, "image")[1]]}
+    return {"trained": [training_facts(policy) for policy in train_for(o, ALONE * seconds, "image")[1]]}
 
 
 PARTS = dict(

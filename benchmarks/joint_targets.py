@@ -19,7 +19,9 @@ import numpy as np
 from robomimic import run
 from tqdm import tqdm
 
-from lab.options import PRESETS, script, with_parts
+from lab.command_line import script
+from lab.options import with_parts
+from lab.presets import PRESETS
 from lab.scripted.episode import Episode, write_robomimic
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lab.options import script
+from lab.command_line import script
 from lab.plots import colors_of, new_figure, save
 from lab.report import summary, table
 from lab.rows import PLAYED, read_rows

@@ -16,7 +16,9 @@ import sys
 
 from robomimic import run
 
-from lab.options import IMAGES, PRESETS, Options, adapted, script, with_parts
+from lab.command_line import script
+from lab.options import Options, with_parts
+from lab.presets import IMAGES, PRESETS, adapted
 
 LARGE = ("paper", "much-ado")  # presets for a GPU, which see images
 

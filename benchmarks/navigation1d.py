@@ -15,10 +15,11 @@ from typing import Any
 import pandas as pd
 import torch
 
+from lab.command_line import parse, script, started
 from lab.comparison import train_all
 from lab.measures import straightness
 from lab.navigation import judge_navigation, play_navigation
-from lab.options import Evaluation, Options, Sources, check_single, parse, script, started
+from lab.options import Evaluation, Options, Sources, check_single
 from lab.plots import plot_flow_paths, plot_navigation
 from lab.policies import policies_of, trained_actors, write_rows
 from lab.report import labelled, table, unlike, write_report

@@ -29,18 +29,11 @@ from lab.agents import (
     environment,
     frozen_policies,
 )
-from lab.options import (
-    PRESETS,
-    Evaluation,
-    Sources,
-    parse,
-    script,
-    started,
-    study,
-    with_parts,
-)
+from lab.command_line import parse, script, started
+from lab.options import Evaluation, Sources, with_parts
 from lab.plots import plot_lines, plot_success
 from lab.policies import slug, write_rows
+from lab.presets import PRESETS, study
 from lab.report import labelled, setting_title, table, write_report
 from lab.rows import AGENT, read_rows
 from lab.tasks import DataOptions

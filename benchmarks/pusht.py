@@ -19,7 +19,9 @@ import numpy as np
 from robomimic import run
 from torchrl.envs import EnvBase
 
-from lab.options import PRESETS, script, with_parts
+from lab.command_line import script
+from lab.options import with_parts
+from lab.presets import PRESETS
 from lab.tasks import DataOptions
 from warmprior.data import lerobot_steps
 from warmprior.envs import gym_env

@@ -16,11 +16,13 @@ import sys
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
+from lab.command_line import parse, script, started
 from lab.comparison import compare
 from lab.methods import Method
-from lab.options import PRESETS, Options, check_given, check_single, parse, script, started, study
+from lab.options import Options, check_given, check_single
 from lab.plots import plot_bars
 from lab.policies import Cell, policies_of
+from lab.presets import PRESETS, study
 from lab.report import labelled, per_seed, table, write_report
 from lab.tasks import check_counts
 from warmprior.modules.real_time_chunking import RealTimeChunking

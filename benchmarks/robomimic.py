@@ -14,10 +14,12 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from lab.command_line import parse, script, started
 from lab.comparison import compare
-from lab.options import PRESETS, Options, parse, script, started
+from lab.options import Options
 from lab.pictures import draw
 from lab.policies import policies_of
+from lab.presets import PRESETS
 from lab.report import success_report, summary, terminal_table, unlike, write_report
 
 

@@ -15,12 +15,14 @@ from dataclasses import replace
 
 import pandas as pd
 
+from lab.command_line import parse, script, started
 from lab.comparison import compare
 from lab.measures import held_out, straightness
-from lab.options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
+from lab.options import MeasuredOptions, Options, check_single
 from lab.paper import paper_success
 from lab.plots import plot_lines
 from lab.policies import policies_of, trained_actors, write_rows
+from lab.presets import PRESETS, study
 from lab.report import labelled, per_seed, pooled, table, write_report
 from lab.tasks import title_of
 

@@ -33,7 +33,7 @@ def _text(page: Path) -> str:
 
 
 def _anchors(page: Path) -> set[str]:
-    """What GitHub makes of the headings: lower case, without punctuation, hyphens for spaces."""
+    """Return GitHub's anchors of the headings: lower case, without punctuation, hyphens for spaces."""
     anchors: list[str] = []
     for heading in re.findall(r"^#+ +(.+?)[ ]*$", _text(page), re.M):
         plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower()

@@ -1,6 +1,7 @@
 """The lab holds what the benchmarks share: options, tasks, methods, jobs, rows and pictures.
 
-- options: the options, a dataclass per concern, and the presets.
+- options, presets: the options, a dataclass per concern, and where they start.
+- command_line, stored_options: what a script reads, its folder, and the options of runs before it.
 - tasks: the tasks, and where their demonstrations come from.
 - scripted, downloads, render: scripted experts, official files, images from simulator states.
 - methods, learned_sources, bridge, mip: the methods that ``--prior`` names.

@@ -27,9 +27,10 @@ from torchrl.record.loggers import get_logger
 from lab.leader import leader_first
 from lab.learned_sources import Learner, learn
 from lab.methods import Method
-from lab.options import Evaluation, Options, Run, of_run, stored_options, with_parts
+from lab.options import Evaluation, Options, Run, with_parts
 from lab.rows import read_rows
 from lab.source_errors import mean_revision
+from lab.stored_options import of_run, stored_options
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness

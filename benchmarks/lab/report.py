@@ -20,8 +20,9 @@ from pandas import DataFrame, Series
 from lab.columns import COLUMNS, IDENTITY, column
 from lab.files import PartialFailure
 from lab.methods import label
-from lab.options import IMAGES, Options, with_parts
+from lab.options import Options, with_parts
 from lab.paper import paper_success
+from lab.presets import IMAGES
 from lab.rows import read_rows
 from lab.statistics import paired_probability_better, probability_better
 from warmprior.diagnostics import success_posterior

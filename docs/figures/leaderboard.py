@@ -114,12 +114,13 @@ def draw() -> None:
 
 def table() -> str:
     """The standings, in Markdown."""
-    names, told = ("mean", *FAMILIES), pairs()
+    names, won_and_lost = ("mean", *FAMILIES), pairs()
     text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | trainings |"]
     text.append("|---" * (5 + len(names)) + "|")
     for _, row in standings().iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
-        pair = told.loc[row["source"], row["nfe"]] if (row["source"], row["nfe"]) in told.index else None
+        setting = row["source"], row["nfe"]
+        pair = won_and_lost.loc[setting] if setting in won_and_lost.index else None
         rates = [f"{row[name] + 1e-6:.0f}" for name in names]
         cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
         text.append(

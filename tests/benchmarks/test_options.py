@@ -19,8 +19,11 @@ import real_time_chunking
 import sigma
 from mimicgen_tasks import FEW
 
-from lab.options import PRESETS, Options, from_record, parse, recorded, started, stored_options, study
+from lab.command_line import parse, started
+from lab.options import Options
+from lab.presets import PRESETS, study
 from lab.report import unlike
+from lab.stored_options import from_record, recorded, stored_options
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [

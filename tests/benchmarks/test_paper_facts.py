@@ -38,7 +38,10 @@ import prior_space_rl
 import robomimic
 
 from lab import paper, timing
-from lab.options import IMAGES, PRESETS, parse, recorded, with_parts
+from lab.command_line import parse
+from lab.options import with_parts
+from lab.presets import IMAGES, PRESETS
+from lab.stored_options import recorded
 from lab.tasks import navigation_task
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
@@ -133,7 +136,7 @@ def test_the_recipe_from_images(monkeypatch):
     assert recipe(with_parts(PRESETS["paper"], **IMAGES["paper"], data={"obs": "image"})) == IMAGE
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
-    monkeypatch.setattr("lab.options.imagenet_weights", lambda: None)  # nothing is downloaded
+    monkeypatch.setattr("lab.presets.imagenet_weights", lambda: None)  # nothing is downloaded
     asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]

@@ -16,8 +16,9 @@ from torchrl.envs import TransformedEnv
 
 from lab import jobs
 from lab import policies as common
-from lab.options import PRESETS, parse
+from lab.command_line import parse
 from lab.policies import Cell, play
+from lab.presets import PRESETS
 from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
 from tests.benchmarks.drift import DriftEnv, arguments

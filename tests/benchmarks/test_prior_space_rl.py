@@ -17,7 +17,7 @@ pytest.importorskip("tyro")
 import prior_space_rl as benchmark
 import robomimic
 
-from lab.options import parse
+from lab.command_line import parse
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.rl import has_anchor
 

@@ -25,7 +25,8 @@ import navigation1d
 import robomimic
 
 from lab import pictures
-from lab.options import PRESETS, parse, started
+from lab.command_line import parse, started
+from lab.presets import PRESETS
 from warmprior.envs import rendering_backend
 from warmprior.training.checkpoint import load_state
 

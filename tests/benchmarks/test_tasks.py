@@ -29,8 +29,9 @@ import mimicgen_tasks
 import pusht
 import robomimic
 
-from lab.options import Options, stored_options, with_parts
+from lab.options import Options, with_parts
 from lab.policies import policies_of
+from lab.stored_options import stored_options
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
 

@@ -15,8 +15,10 @@ import torch
 from pyarrow import parquet
 from tensordict import TensorDict
 
-from lab.options import PRESETS, Options, recorded, stored_options, with_parts
+from lab.options import Options, with_parts
+from lab.presets import PRESETS
 from lab.rows import PLAYED, read_rows
+from lab.stored_options import recorded, stored_options
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.sandbox import Outcome
 from tests.training.cloning_parts import CONFIG, training

@@ -32,7 +32,7 @@ LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
 """Options beside Algorithm 1's; the average is the teacher."""
 
 PUBLIC = {"max_grad_norm": 1.2, "count_padding": True, "warmup_ratio": 0.0}
-"""Of the public code that the paper may stand on."""
+"""The kinds of options in which the preset `much-ado` differs from `paper`."""
 
 
 @pytest.mark.parametrize("options", [{}, LATER, PUBLIC], ids=["algorithm 1", "later", "public code"])

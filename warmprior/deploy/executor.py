@@ -45,7 +45,7 @@ class AsyncExecutor:
 
     Every ``execute`` control steps a decision begins in a thread, with the observation of that step. Until
     its chunk is ready, the robot continues the old one; the new chunk takes effect at the position that the
-    robot has reached. The policy is told to expect the largest delay of the last decisions (``("rtc",
+    robot has reached. The policy expects the largest delay of the last decisions (``("rtc",
     "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is always
     current, even if a decision is late: it holds each executed action and the rest of the chunk, which is
     empty once the chunk is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with
