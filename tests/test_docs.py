@@ -151,17 +151,18 @@ def test_the_prior_of_your_own_runs():
 
 def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
     monkeypatch.syspath_prepend(DOCS / "figures")
-    results, leaderboard = importlib.import_module("results"), importlib.import_module("leaderboard")
+    names = ("results", "leaderboard", "pages", "shared")
+    results, leaderboard, pages, shared = map(importlib.import_module, names)
     texts = {page: page.read_text() for page in (*results.tables(), *leaderboard.tables())}
     for page, table in (results.tables() | leaderboard.tables()).items():
-        assert results.with_tables(texts[page], table) == texts[page]
+        assert pages.with_tables(texts[page], table) == texts[page]
     text = "".join(texts.values())
-    played = {name for name, _ in results.PLAYED.findall(text)}
-    assert played == {path.stem for path in results.DATA.glob("*.jsonl")}
+    played = {name for name, _ in pages.PLAYED.findall(text)}
+    assert played == {path.stem for path in shared.DATA.glob("*.jsonl")}
     shown = set(re.findall(r"_static/results/(\w+)\.svg\)", text))
-    assert shown == {path.stem for path in results.OUT.iterdir()}
-    for file in results.DATA.glob("*.csv"):
-        rows = results.read(file.stem)
+    assert shown == {path.stem for path in shared.OUT.iterdir()}
+    for file in shared.DATA.glob("*.csv"):
+        rows = shared.read(file.stem)
         assert rows["success"].between(0, 100).all() and rows["command"].notna().all()
 
 

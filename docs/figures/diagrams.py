@@ -5,17 +5,13 @@ python docs/figures/diagrams.py    # or: make results; writes docs/_static
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from shared import DOCS, SVG
 
-OUT = Path(__file__).parents[1] / "_static"
+OUT = DOCS / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
-SVG = {"metadata": {"Date": None}}  # the same file every time
-matplotlib.rcParams["svg.hashsalt"] = "warmprior"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior(8), nfe=3", BLUE),
     ("Are actions absolute poses\nor joint targets of an arm?", "GaussianPrior(8), nfe=3", GREY),

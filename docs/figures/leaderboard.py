@@ -13,8 +13,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from pages import write
 from pandas import DataFrame, concat
-from results import (
+from scipy.stats import rankdata
+from shared import (
     CORRELATED,
     DOCS,
     GAUSSIAN,
@@ -28,9 +30,7 @@ from results import (
     read,
     read_played,
     save,
-    write,
 )
-from scipy.stats import rankdata
 
 from lab.statistics import resampled_means
 

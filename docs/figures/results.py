@@ -9,65 +9,36 @@ the episodes of all seeds as independent; training seeds differ by more than tha
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from pandas import DataFrame, Series, concat, read_csv, read_json
+from pages import write
+from pandas import DataFrame, Series, concat, read_json
+from shared import (
+    CORRELATED,
+    DATA,
+    DOCS,
+    GAUSSIAN,
+    OPERATORS,
+    OUT,
+    PAST,
+    PREVIEW,
+    SOURCES,
+    SVG,
+    WIDE,
+    WIDTH,
+    figure,
+    finish,
+    lines,
+    read,
+    save,
+    wilson,
+)
 
 from lab.paper import PAPER_DEFAULT_SIGMA, PAPER_SUCCESS, STATE
-from lab.statistics import chosen_elsewhere
 
-matplotlib.rcParams["svg.hashsalt"] = "warmprior"  # the same file every time
-DOCS = Path(__file__).parents[1]
-DATA, OUT, PAGE = DOCS / "results", DOCS / "_static" / "results", DOCS / "results.md"
-GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
-CORRELATED, WIDE = "past,correlation=0.5", "past,sigma=1"
-SOURCES = {  # what a chart calls them, in which colour and with which mark
-    GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
-    PAST: ("WP-Past", "#1f77b4", "o"),
-    PREVIEW: ("WP-Preview", "#d95f02", "o"),
-    CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
-    WIDE: ("WP-Past, sigma = 1", "#984ea3", "o"),
-    "preview,correlation=0.5": ("WP-Preview, correlated noise", "#e6ab02", "o"),
-    "ot": ("OT-CFM", "0.2", "s"),
-    "cvae": ("learned, autoencoder", "0.2", "^"),
-    "leap": ("learned, of the observation", "0.2", "v"),
-    "step,start_time=0.5": ("STEP", "0.2", "D"),
-    "history": ("history conditioning", "0.2", "P"),
-    "a2a": ("learned, of the last actions", "0.2", "X"),
-    "forecast": ("learned, of both", "0.2", "*"),
-    "regression": ("regression", "0.2", "p"),
-    "mip": ("MIP", "#a6761d", "s"),
-}
-WIDTH = 5.6  # of a picture, in inches: readable on a screen of 400 pixels
-OPERATORS = {"ph": "one operator", "mh": "six operators"}
-
-
-def read(name: str) -> DataFrame:
-    """The rows of one file, with the number of episodes that each stands for."""
-    rows = read_csv(DATA / f"{name}.csv", comment="#")
-    tasks = rows["settings"] if "settings" in rows else rows["task"].str.split().str.len()
-    return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
-
-
-def read_played(name: str) -> DataFrame:
-    """The rows of a run, with their source, the factor of its noise, and the outcome of every episode."""
-    rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
-    options = rows["options"].where(rows["options"] == "", "," + rows["options"])
-    rows = rows.assign(source=rows["prior"] + options, noise=rows.get("temperature", Series(1.0, rows.index)))
-    return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
-
-
-def wilson(success: float, total: float) -> np.ndarray:
-    """Lower and upper end of a success rate's interval, in percent."""
-    p, z2 = success / 100, 1.96**2 / total
-    half = np.sqrt(p * (1 - p) * z2 + z2**2 / 4)
-    return 100 * (p + z2 / 2 + np.array([-half, half])) / (1 + z2)
+PAGE = DOCS / "results.md"
 
 
 def gain(row: Series, base: Series) -> tuple[float, float, float]:
@@ -94,47 +65,6 @@ def gains() -> DataFrame:
             for _, row in group[group["source"] != GAUSSIAN].iterrows():
                 found.append([setting, row["source"], *gain(row, base)])
     return DataFrame(found, columns=["setting", "source", "gain", "down", "up"])
-
-
-def figure(width: float, height: float, columns: int, title: str, rows: int = 1) -> tuple[Figure, list[Axes]]:
-    """A picture with a title that says what it shows, and its axes."""
-    made = Figure(figsize=(width, height), layout="constrained")
-    made.suptitle(title, fontsize=11.5, fontweight="bold")
-    return made, list(made.subplots(rows, columns, squeeze=False).flat)
-
-
-def save(made: Figure, name: str, columns: int = 2) -> None:
-    """Write the picture, with one legend below."""
-    shown = [pair for axis in made.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in reversed(shown)}
-    labels = sorted(handles, key=[label for _, label in shown].index)
-    made.legend(
-        [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, frameon=False
-    )
-    made.savefig(OUT / f"{name}.svg", metadata={"Date": None})
-
-
-def finish(axis: Axes, title: str, **settings: object) -> None:
-    """Title, labels and a faint grid."""
-    axis.set_title(title, fontsize=10.5)
-    axis.set(**settings)
-    axis.grid(axis="y", color="0.9")
-
-
-def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool = True) -> None:
-    """Success against a column, a line per source."""
-    for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
-        part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
-        if len(part):
-            ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
-            bars = np.abs(ends - part["success"].to_numpy()) if interval else None
-            places = part.index.to_numpy(dtype=float) * (1 + 0.025 * (k - 2))
-            axis.errorbar(
-                places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
-            )
-    axis.set(xscale="log", ylim=(-3, 103))
-    axis.set_xticks(ticks, [f"{n:,}" for n in ticks])
-    axis.minorticks_off()
 
 
 def one_step() -> None:
@@ -258,7 +188,7 @@ def noise() -> None:
         finish(axis, name, xlabel="noise that averaging over a chunk leaves", xlim=(0, None))
         axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
     made.supylabel("success minus the Gaussian source's, in points", fontsize=10)
-    made.savefig(OUT / "noise.svg", metadata={"Date": None})
+    made.savefig(OUT / "noise.svg", **SVG)
 
 
 def actions() -> None:
@@ -347,69 +277,9 @@ def paper_table() -> str:
     return "\n".join(text) + "\n"
 
 
-def played_table(name: str) -> str:
-    """Success of the rows of a run, in Markdown: percent, and episodes won and lost of the Gaussian source's.
-
-    A line per NFE and factor of the source's noise, and per NFE one in which every source has its own best
-    factor, chosen on other episodes. Seeds are taken together.
-    """
-    rows = read_played(name)
-    names = [source for source in SOURCES if source in set(rows["source"])]
-    text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
-    text.append("|---" * (2 + len(names)) + "|")
-    for nfe, part in rows.sort_values(["nfe", "noise"], ascending=False).groupby("nfe", sort=False):
-        solved = {
-            (noise, source): np.concatenate(list(group.sort_values("seed")["solved"]))
-            for (noise, source), group in part.groupby(["noise", "source"], sort=False)
-        }
-        noises = list(dict.fromkeys(noise for noise, _ in solved))
-        text += [
-            _played_line(nfe, f"{n:g}", {s: solved[n, s] for s in names if (n, s) in solved}, names)
-            for n in noises
-        ]
-        if len(noises) > 1:
-            every = {s: [solved[n, s] for n in noises if (n, s) in solved] for s in names}
-            best = {s: chosen_elsewhere(np.stack(e)) for s, e in every.items() if len(e) == len(noises)}
-            text.append(_played_line(nfe, "own best", best, names))
-    return "\n".join(text) + "\n"
-
-
-def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: list[str]) -> str:
-    most, base, cells = max(each.mean() for each in solved.values()), solved.get(GAUSSIAN), []
-    for source in names:
-        mine = solved.get(source)
-        if mine is None:
-            cells.append("")
-            continue
-        rate = f"{100 * mine.mean() + 1e-6:.0f}"
-        rate = f"**{rate}**" if mine.mean() == most else rate
-        if source != GAUSSIAN and base is not None and len(mine) == len(base):
-            rate += f" ({(mine > base).sum()} : {(mine < base).sum()})"
-        cells.append(rate)
-    return f"| {nfe} | {noise} | " + " | ".join(cells) + " |"
-
-
-TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the table of a page that has one."""
-PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the table of a run's rows in a page."""
-
-
 def tables() -> dict[Path, str]:
     """The table that each page marks."""
     return {PAGE: table(), DOCS / "notes" / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
-
-
-def with_tables(page: str, text: str) -> str:
-    """A page with its table, and those of the runs whose rows it names."""
-    page = TABLE.sub(lambda _: text, page)
-    return PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", page)
-
-
-def write(pages: Mapping[Path, str]) -> None:
-    """Write the tables into their pages."""
-    for page, text in pages.items():
-        page.write_text(with_tables(page.read_text(), text))
 
 
 if __name__ == "__main__":

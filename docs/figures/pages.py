@@ -1,0 +1,74 @@
+"""The tables that pages mark: one of their own, and one per run whose rows they name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from shared import GAUSSIAN, SOURCES, read_played
+
+from lab.statistics import chosen_elsewhere
+
+TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
+
+"""This matches the table of a page that has one."""
+PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+
+
+"""This matches the table of a run's rows in a page."""
+
+
+def played_table(name: str) -> str:
+    """Success of the rows of a run, in Markdown: percent, and episodes won and lost of the Gaussian source's.
+
+    A line per NFE and factor of the source's noise, and per NFE one in which every source has its own best
+    factor, chosen on other episodes. Seeds are taken together.
+    """
+    rows = read_played(name)
+    names = [source for source in SOURCES if source in set(rows["source"])]
+    text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
+    text.append("|---" * (2 + len(names)) + "|")
+    for nfe, part in rows.sort_values(["nfe", "noise"], ascending=False).groupby("nfe", sort=False):
+        solved = {
+            (noise, source): np.concatenate(list(group.sort_values("seed")["solved"]))
+            for (noise, source), group in part.groupby(["noise", "source"], sort=False)
+        }
+        noises = list(dict.fromkeys(noise for noise, _ in solved))
+        text += [
+            _played_line(nfe, f"{n:g}", {s: solved[n, s] for s in names if (n, s) in solved}, names)
+            for n in noises
+        ]
+        if len(noises) > 1:
+            every = {s: [solved[n, s] for n in noises if (n, s) in solved] for s in names}
+            best = {s: chosen_elsewhere(np.stack(e)) for s, e in every.items() if len(e) == len(noises)}
+            text.append(_played_line(nfe, "own best", best, names))
+    return "\n".join(text) + "\n"
+
+
+def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: list[str]) -> str:
+    most, base, cells = max(each.mean() for each in solved.values()), solved.get(GAUSSIAN), []
+    for source in names:
+        mine = solved.get(source)
+        if mine is None:
+            cells.append("")
+            continue
+        rate = f"{100 * mine.mean() + 1e-6:.0f}"
+        rate = f"**{rate}**" if mine.mean() == most else rate
+        if source != GAUSSIAN and base is not None and len(mine) == len(base):
+            rate += f" ({(mine > base).sum()} : {(mine < base).sum()})"
+        cells.append(rate)
+    return f"| {nfe} | {noise} | " + " | ".join(cells) + " |"
+
+
+def with_tables(page: str, text: str) -> str:
+    """A page with its table, and those of the runs whose rows it names."""
+    page = TABLE.sub(lambda _: text, page)
+    return PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", page)
+
+
+def write(pages: Mapping[Path, str]) -> None:
+    """Write the tables into their pages."""
+    for page, text in pages.items():
+        page.write_text(with_tables(page.read_text(), text))
