@@ -47,15 +47,17 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         task = played[0].task()
         if not options.run.videos:
             continue
-        drawn = task.environment is not None  # of robosuite or Gymnasium
-        if drawn and rendering_backend() is None:
+        if "robosuite" in (task.environment or {}) and rendering_backend() is None:
             print(
                 "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "
                 "apt-get install libegl1 libegl-mesa0 (or libosmesa6)."
             )
-        elif drawn or task.video_rate is not None:
+        elif task.environment is not None or task.video_rate is not None:
             for method, policy in {label[p.name]: p for p in reversed(played)}.items():
-                video(options, policy, method, end)
+                try:
+                    video(options, policy, method, end)
+                except Exception as error:  # other people's environments draw in their own ways, or not
+                    print(f"No filmstrip of {method}: {error}")
 
 
 def video(options: Options, policy: Policy, method: str, end: str) -> None:

@@ -141,20 +141,24 @@ def record_filmstrip(
     if video is not None and (size < 2 or size % 2):  # the encoder takes pixels two by two
         raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
     success = options.pop("success", SUCCESS)
+    renders_itself = env is not None
     if env is None:
         from warmprior.envs.description import environment_of, is_registered
+        from warmprior.envs.rendering import EnvRenderers, require_rendering
 
-        if is_registered(actor.environment):
-            env = environment_of(actor, render_mode="rgb_array", **options)
-            rate = rate or env.base_env.metadata.get("render_fps")
+        renders_itself = is_registered(actor.environment)
+        if renders_itself:
+            options["render_mode"] = "rgb_array"
+        else:
+            require_rendering()
+        env = environment_of(actor, **options)
     frame: Callable[[Any, int], np.ndarray]
     quick: Callable[[Any, int], np.ndarray]
     frame = quick = _resized
-    if env is None:
-        from warmprior.envs.rendering import EnvRenderers, require_rendering
-
-        require_rendering()
-        env = environment_of(actor, **options)
+    if renders_itself:
+        look = partial(_picture, env.base_env)
+        rate = rate or getattr(env.base_env, "metadata", {}).get("render_fps")
+    else:
         simulator, loop = env.base_env, env.base_env.loop
         look = loop.state
         # Rendering every control step of a video in full quality would take ten times as long as the episode.
@@ -164,8 +168,6 @@ def record_filmstrip(
             lambda state, size: renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq]),
         )
         rate = rate or round(1 / loop.env.control_timestep)
-    else:
-        look = partial(_picture, env.base_env)
     # Inserted first, so that it runs at every control step inside a chunk.
     recorder = _Recorder(look)
     env.transform.insert(0, recorder)
