@@ -1,0 +1,134 @@
+"""What a robot's drivers return reaches the policy as its training had it, or is refused by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.deploy.test_executor import OBSERVATION_DIM, Scripted, actor
+from tests.toy_env import ACTION_DIM
+from warmprior import ImageEncoder, Normalizer, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior.deploy import AsyncExecutor
+
+CAMERAS = ("front_image", "wrist_image")
+
+
+def sighted(**options):
+    """A policy of two cameras of 16 x 16 pixels, whose central 12 x 12 it sees, and a state of 3."""
+    torch.manual_seed(0)
+    encoder = ImageEncoder(CAMERAS, 3, image_size=16, crop_size=12, backbone="small")
+    velocity = VelocityMLP(ACTION_DIM, encoder.observation_dim, 6, hidden_dim=16)
+    with torch.no_grad():
+        for parameter in velocity.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    bounds = ("observation", "state"), "action"
+    normalizer = Normalizer(
+        {key: torch.full((n,), -3.0) for key, n in zip(bounds, (3, ACTION_DIM), strict=True)},
+        {key: torch.full((n,), 5.0) for key, n in zip(bounds, (3, ACTION_DIM), strict=True)},
+    )
+    generator = torch.Generator().manual_seed(5)
+    network = VisionNetwork(encoder, velocity)
+    return WarmPriorActor(network, PastPrior(6), nfe=2, normalizer=normalizer, generator=generator, **options)
+
+
+def seen_by(policy):
+    found = []
+    policy.register_forward_pre_hook(lambda module, args: found.append(args[0]["observation"].clone()))
+    return found
+
+
+def pictures(height, width):
+    return {name: np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8) for name in CAMERAS}
+
+
+def test_images_are_those_of_the_training():
+    """Channels first and of the training's size, whatever a camera gives; the state in the policy's units."""
+    image = pytest.importorskip("PIL.Image")
+    policy = sighted()
+    found = seen_by(policy)
+    with AsyncExecutor(policy, latency=0, execute=1) as executor:
+        assert executor._frames.maxlen == 2
+        images = pictures(16, 16)
+        first = executor.act({"state": np.array([5.0, 1.0, -3.0]), **images, "speed": 3.0})
+        large = pictures(50, 70)
+        executor.act({"state": torch.tensor([5.0, 1.0, -3.0]), **large})
+    seen = found[0]
+    assert set(seen.keys()) == {"state", *CAMERAS}
+    assert seen["state"].tolist() == [[1.0, 0.0, -1.0]] * 2
+    for name in CAMERAS:
+        assert torch.equal(seen[name], torch.from_numpy(images[name]).permute(2, 0, 1).expand(2, 3, 16, 16))
+        small = np.array(image.fromarray(large[name]).resize((16, 16), image.Resampling.BILINEAR), np.int64)
+        resized = found[1][name][1].permute(1, 2, 0).long()
+        assert np.abs(resized.numpy() - small).max() <= 1
+    # What the encoder then sees is the middle: its own crop, in evaluation mode.
+    outside = {name: image.copy() for name, image in images.items()}
+    for picture in outside.values():
+        picture[:2] = picture[-2:] = picture[:, :2] = picture[:, -2:] = 0
+    with AsyncExecutor(sighted(), latency=0) as executor:
+        assert torch.equal(executor.act({"state": torch.tensor([5.0, 1.0, -3.0]), **outside}), first)
+    assert first.min() >= -3 and first.max() <= 5
+
+
+def test_images_in_every_form_are_equal():
+    images, state = pictures(24, 40), [0.0, 1.0, 2.0]
+    turned = {name: image[..., ::-1].copy()[..., ::-1] for name, image in images.items()}  # BGR to RGB
+    first = {name: torch.from_numpy(image).permute(2, 0, 1) for name, image in images.items()}
+    nested = TensorDict({"state": torch.tensor(state), **first})
+    actions = []
+    for observation in ({"state": state, **images}, {"state": state, **turned}, nested):
+        with AsyncExecutor(sighted(), latency=0) as executor:
+            actions.append(executor.act(observation))
+    assert torch.equal(actions[0], actions[1]) and torch.equal(actions[0], actions[2])
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "said"),
+    [
+        ({"wrist_image": None}, KeyError, ["wrist_image"]),
+        ({"state": np.zeros(4)}, ValueError, ["state", "[4]", "[3]"]),
+        (
+            {"front_image": np.zeros((16, 16, 3))},
+            ValueError,
+            ["front_image", "[16, 16, 3]", "float64", "uint8"],
+        ),
+        ({"front_image": np.zeros((16, 16), np.uint8)}, ValueError, ["front_image", "[16, 16]"]),
+        ({"front_image": np.zeros((16, 16, 4), np.uint8)}, ValueError, ["front_image", "[16, 16, 4]"]),
+        ({"front_image": np.zeros((0, 16, 3), np.uint8)}, ValueError, ["front_image", "[0, 16, 3]"]),
+        ({"front_image": "no signal"}, ValueError, ["front_image", "str"]),
+    ],
+)
+def test_what_is_no_observation_is_refused_and_changes_nothing(change, kind, said):
+    usual = {"state": np.zeros(3), **pictures(20, 20)}
+    with AsyncExecutor(sighted(), latency=0) as executor, AsyncExecutor(sighted(), latency=0) as other:
+        for _ in range(8):
+            with pytest.raises(kind) as refused:
+                executor.act(usual | change)
+            assert all(word in str(refused.value) for word in said) and "\n" not in str(refused.value)
+            assert torch.equal(executor.act(usual), other.act(usual))
+        with pytest.raises(ValueError, match="front_image"):
+            executor.act(np.zeros(3))
+
+
+def test_a_vector_may_be_the_state_among_others():
+    usual = {"latency": 0}
+    one, two = AsyncExecutor(actor(PastPrior(6)), **usual), AsyncExecutor(actor(PastPrior(6)), **usual)
+    seen = np.linspace(-1, 1, OBSERVATION_DIM)
+    for _ in range(8):
+        assert torch.equal(
+            one.act({"state": seen, "front_image": pictures(8, 8)}), two.act(torch.tensor(seen))
+        )
+    with pytest.raises(ValueError, match=rf"\[1\].*\[{OBSERVATION_DIM}\]"):  # it would be broadcast
+        one.act(torch.zeros(1))
+    with pytest.raises(KeyError, match=r"state.*front_image"):
+        one.act({"front_image": pictures(8, 8)})
+
+
+def test_drivers_reuse_their_memory():
+    policy, memory = Scripted(8), np.zeros(1)
+    with AsyncExecutor(policy, prior=PastPrior(8), action_dim=2, latency=0, execute=1) as executor:
+        for tick in range(3):
+            memory[:] = tick
+            executor.act(memory)
+    assert policy.given[-1]["observation"].flatten().tolist() == [1.0, 2.0]
