@@ -27,7 +27,7 @@ import torch
 
 from lab.bridge import BridgeCoupling
 from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
-from lab.mip import SECOND, MIPCoupling
+from lab.mip import SECOND, MIPCoupling, TwoStepCoupling
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
 from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of
@@ -127,6 +127,8 @@ class Composition:
     played: Mapping[str, Any] = field(default_factory=dict)  # options of `Sampling`, where it is no flow
 
 
+TWO_STEPS = {"nfe": 2, "grid": f"dense-jump:{SECOND}", "temperature": 0.0}
+
 METHODS: dict[str, Composition] = {
     "gaussian": Composition("Gaussian source", "#7f7f7f"),
     "past": Composition("WP-Past", "#1f77b4", PastPrior),
@@ -134,11 +136,9 @@ METHODS: dict[str, Composition] = {
     "forecast": Composition("WP-Forecast", "#d62728", ForecastPrior),
     "history": Composition("History", "#6a51a3", sees_history=True),
     "regression": Composition("Regression", "#b8860b", PointPrior, played={"nfe": 1}),
-    "mip": Composition(
-        "MIP",
-        "#393b79",
-        coupling=MIPCoupling,
-        played={"nfe": 2, "grid": f"dense-jump:{SECOND}", "temperature": 0.0},
+    "mip": Composition("MIP", "#393b79", coupling=MIPCoupling, played=TWO_STEPS),
+    "mip-past": Composition(
+        "MIP from WP-Past", "#5254a3", PastPrior, coupling=TwoStepCoupling, played=TWO_STEPS
     ),
     "warm-start": Composition("Warm start", "#e6550d", TwoChunkPrior, start=WarmStart),
     "ot": Composition("OT-CFM", "#2ca02c", coupling=OTCoupling),

@@ -1,4 +1,4 @@
-"""MIP: two supervised steps, from the point 0 and from nearly the action, in the parts of a flow."""
+"""MIP: two supervised steps, from the point 0 or a source and from nearly the action, in a flow's parts."""
 
 from __future__ import annotations
 
@@ -33,20 +33,19 @@ class MIPInterpolant(LinearInterpolant):
         return super().__call__(torch.where(t[..., None, None] > 0, a0, 0.0), a1, t)
 
 
-class MIPCoupling:
-    r"""Minimal Iterative Policy (Pan et al., 2025, arXiv:2512.01809): pairs as they come, at two times.
+class TwoStepCoupling:
+    r"""Pairs as they come, at two times: :math:`t = 0`, at a draw of the source, and :math:`t = 0.9`.
 
-    The network predicts the action from the point 0 at :math:`t = 0`, and again from :math:`0.9 a + 0.1
-    \varepsilon` at :math:`t = 0.9`. With :math:`f = a_t + (1 - t) v` both are velocities on
-    :class:`MIPInterpolant`, and the policy is Euler's method from 0 to 0.9 to 1. Where the network is
-    preconditioned, both errors count in units of what a linear prediction leaves.
+    With :math:`f = a_t + (1 - t) v` the network predicts the action from both points. The policy is Euler's
+    method from 0 to 0.9 to 1. If the network is preconditioned, both errors count in units of what a linear
+    prediction leaves.
     """
 
-    interpolant: ClassVar[MIPInterpolant] = MIPInterpolant()
+    name = "two-steps"
 
     def config(self) -> dict[str, Any]:
-        """Its name: it has no options."""
-        return {"name": "mip"}
+        """Return its name: it has no options."""
+        return {"name": self.name}
 
     def times(
         self, shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
@@ -57,3 +56,13 @@ class MIPCoupling:
 
     def __call__(self, a0: Tensor, a1: Tensor, observation: Any = None) -> tuple[Tensor, Tensor]:
         return a0, a1
+
+
+class MIPCoupling(TwoStepCoupling):
+    r"""Minimal Iterative Policy (Pan et al., 2025, arXiv:2512.01809): two steps, the first from the point 0.
+
+    The second is from :math:`0.9 a + 0.1 \varepsilon`.
+    """
+
+    name = "mip"
+    interpolant: ClassVar[MIPInterpolant] = MIPInterpolant()

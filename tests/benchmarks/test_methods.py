@@ -78,7 +78,7 @@ def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
 def test_history_is_withheld_from_those_alone_that_remember():
     training = TrainingConfig(cold_probability=0.5)
     remember = {name for name in METHODS if Method(name, H).recipe(training).cold_probability}
-    assert remember == {"past", "preview", "forecast", "history", "step", "a2a"}
+    assert remember == {"past", "preview", "forecast", "history", "step", "a2a", "mip-past"}
     vector = {name for name in METHODS if Method(name, H).needs_vector}
     assert vector == {"forecast", "ot", "bridge", "step", "cvae", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector

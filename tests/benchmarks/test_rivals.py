@@ -27,14 +27,15 @@ def predicted(field: VelocityMLP, t: float, point: torch.Tensor, observation: to
     return point + (1 - t) * field(torch.full((len(point),), t), point, observation)
 
 
-def test_mip_is_two_supervised_steps():
-    """f(0, t = 0) and f(0.9 a + 0.1 eps, t = 0.9), both regressed on the action."""
-    method = Method("mip", H)
+@pytest.mark.parametrize("name", ["mip", "mip-past"])
+def test_mip_is_two_supervised_steps(name):
+    """f(0, t = 0) and f(0.9 a + 0.1 eps, t = 0.9), regressed on the action; 0 and eps may be a source."""
+    method = Method(name, H)
     field, prior = network(H), method.prior()
     actor = WarmPriorActor(field, prior, max_nfe=2)
     loss = FlowMatchingLoss(actor, coupling=method.coupling(), reduction="none")
     loss.generator = torch.Generator().manual_seed(5)
-    history = cold_history([64], H, H, 2)
+    history = advance(cold_history([64], H, H, 2), torch.randn(64, H, 2), torch.full((64, 1), H))
     action, observation = torch.randn(64, H, 2), torch.randn(64, 1, 3)
     windows = {keys.CHUNK: action, keys.HISTORY: history, keys.OBSERVATION: observation}
     found = loss(TensorDict(windows, [64]))["loss_flow_matching"]
@@ -43,22 +44,28 @@ def test_mip_is_two_supervised_steps():
     noise = prior.sample(history, observation, same)
     second = torch.rand(64, generator=same) < 0.5
     assert 0 < second.sum() < 64
-    first = predicted(field, 0.0, torch.zeros_like(action), observation) - action
+    begun = noise if name == "mip-past" else torch.zeros_like(action)
+    first = predicted(field, 0.0, begun, observation) - action
     again = predicted(field, 0.9, 0.9 * action + 0.1 * noise, observation) - action
     # Of a velocity, an error is that of the action over 1 - t.
     expected = torch.where(second[:, None, None], again / 0.1, first).square()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
 
 
-def test_mip_is_played_as_its_paper_says():
-    method = Method("mip", H)
+@pytest.mark.parametrize("name", ["mip", "mip-past"])
+def test_mip_is_played_as_its_paper_says(name):
+    """Two steps without noise, from the mean of the source, which is 0 for MIP."""
+    method = Method(name, H)
     field = network(H)
     assert method.nfes((9, 1)) == [2] and method.temperatures((1.0, 0.5)) == [0.0]
     actor = WarmPriorActor(field, method.prior(), **method.parts.played)
     observation = torch.randn(5, 1, 3)
-    data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: cold_history([5], H, H, 2)}, [5])
-    begun = predicted(field, 0.0, torch.zeros(5, H, 2), observation)
-    expected = predicted(field, 0.9, 0.9 * begun, observation)
+    last = torch.randn(5, H, 2)
+    history = advance(cold_history([5], H, H, 2), last, torch.full((5, 1), H))
+    data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, [5])
+    mean = last if name == "mip-past" else torch.zeros(5, H, 2)
+    begun = predicted(field, 0.0, mean, observation)
+    expected = predicted(field, 0.9, 0.9 * begun + 0.1 * mean, observation)
     torch.testing.assert_close(actor(data)[keys.CHUNK], expected, rtol=1e-4, atol=1e-5)
 
 
