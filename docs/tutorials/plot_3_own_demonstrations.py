@@ -199,11 +199,11 @@ class StandsAtTheEnd(Transform):
 
     def __init__(self):
         super().__init__()
-        self.seen = []
+        self.observations = []
 
     def _noted(self, tensordict):
         observation = tensordict["observation"]
-        self.seen.append(observation.clone())
+        self.observations.append(observation.clone())
         return tensordict.set(
             "success", tensordict["truncated"] & (observation[..., :1] > 0.98)
         )
@@ -228,10 +228,12 @@ def play(policy, episodes=20):
         judge, policy_transforms(policy.prior, normalizer=normalizer)
     )
     env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
-    judge.seen.clear()
+    judge.observations.clear()
     played = evaluate(policy, env, episodes=episodes, first_seed=1_000)
-    seen = torch.stack(judge.seen[-201 * episodes :]).view(episodes, 201, 3)
-    return sum(episode.success for episode in played), seen
+    observations = torch.stack(judge.observations[-201 * episodes :]).view(
+        episodes, 201, 3
+    )
+    return sum(episode.success for episode in played), observations
 
 
 def angle(observations):
@@ -241,8 +243,10 @@ def angle(observations):
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.0), sharey=True)
 shown = {"Demonstrations": (None, demos["observation"].view(40, 200, 3))}
 shown |= {name: play(policy) for name, policy in policies.items()}
-for axis, (name, (solved, seen)) in zip(axes, shown.items(), strict=True):
-    for episode in seen[:20]:
+for axis, (name, (solved, observations)) in zip(
+    axes, shown.items(), strict=True
+):
+    for episode in observations[:20]:
         degrees = angle(episode)
         degrees[1:][degrees.diff().abs() > 180] = (
             torch.nan
@@ -304,18 +308,21 @@ def picture(observation, size=200):
     return image
 
 
-_, seen = shown["WP-Past"]
+_, observations = shown["WP-Past"]
 hardest = int(
-    angle(seen[:, 0]).abs().argmax()
+    angle(observations[:, 0]).abs().argmax()
 )  # it starts nearest to hanging down
-Video([picture(observation) for observation in seen[hardest, ::2]], rate=10)
+Video(
+    [picture(observation) for observation in observations[hardest, ::2]],
+    rate=10,
+)
 
 # %%
 # The same episode as pictures, one per second:
 
 figure, axes = plt.subplots(1, 10, figsize=(10, 1.3))
 for second, axis in enumerate(axes):
-    axis.imshow(picture(seen[hardest, 20 * second]))
+    axis.imshow(picture(observations[hardest, 20 * second]))
     axis.set_title(f"{second} s", fontsize=8)
     axis.set(xticks=[], yticks=[])
 plt.show()

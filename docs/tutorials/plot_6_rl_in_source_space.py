@@ -160,8 +160,8 @@ for axis, (name, (anchor, delta)) in zip(axes, anchors.items(), strict=False):
         "anchor": anchor.expand(15, 8, 1),
         "delta": delta * share.view(15, 1, 1).expand(15, 8, 1),
     }
-    seen = demos["observation"][step].expand(15, 1, 9)
-    data = TensorDict({"observation": seen, "prior": prior_keys}, [15])
+    observation = demos["observation"][step].expand(15, 1, 9)
+    data = TensorDict({"observation": observation, "prior": prior_keys}, [15])
     chunks = decoder(data)["vla_action", "chunk"]
     draw_task(axis)
     axis.set_xlim(-0.6, 0.2)
@@ -179,14 +179,16 @@ axes[1].legend(loc="lower left")
 # The first decision of an episode: the anchor is a draw of the Gaussian source.
 decoder = PriorDecoder(policies["WP-Past"], delta=0.5)
 draws = torch.randn(200, 8, 1)
-seen = demos["observation"][0].expand(200, 1, 9)
+observation = demos["observation"][0].expand(200, 1, 9)
 above = []
 for where in share:
     prior_keys = {
         "anchor": draws,
         "delta": torch.full_like(draws, 0.5 * where),
     }
-    data = TensorDict({"observation": seen, "prior": prior_keys}, [200])
+    data = TensorDict(
+        {"observation": observation, "prior": prior_keys}, [200]
+    )
     chunks = decoder(data)["vla_action", "chunk"]
     above.append((chunks[:, -1, 0] > 0).float().mean())
 axes[2].plot(0.5 * share, above, "o-", color="black", ms=3)

@@ -73,14 +73,14 @@ recorder.finalize()
 # chunk of four.
 
 H = 4
-wanted = history_indices(H, H)
-print("steps of each training window:", wanted)
+window_steps = history_indices(H, H)
+print("steps of each training window:", window_steps)
 dataset = LeRobotDataset(
     "me/navigation",
     root=root / "navigation",
     delta_timestamps={
         "observation.state": [0.0],
-        "action": [step / 10 for step in wanted],
+        "action": [step / 10 for step in window_steps],
     },
 )
 

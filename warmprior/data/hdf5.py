@@ -341,11 +341,11 @@ def read_index(
             usual = [key for key in low_dim_keys(arms=2) if key in available]
             others = [key for key in available if key not in usual and not key.startswith("robot")]
             keys = (*usual, *(key for key in others if _is_vector(observations, key)))
-        wanted = [f"obs/{key}" for key in keys]
+        obs_names = [f"obs/{key}" for key in keys]
         if poses:
             actions = member(file, f"data/{selected[0]}/actions", "dataset")
             width = actions.shape[-1] if actions is not None and actions.shape else 0
-            wanted += [f"obs/{key}" for key in pose_keys(width)]
+            obs_names += [f"obs/{key}" for key in pose_keys(width)]
         expected, whose = {}, env_args.get("env_name", str(path))
         if task is not None:
             if declared_poses(path, env_args) is not None:  # other controllers have other widths
@@ -358,7 +358,7 @@ def read_index(
             demo = member(file["data"], name, "group")
             if demo is None:  # the name is listed, but a damaged index hides the demo
                 raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
-            steps, widths = _widths(demo, wanted)
+            steps, widths = _widths(demo, obs_names)
             if lengths and widths.keys() != expected.keys():
                 raise DatasetError(f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'")
             for key, width in expected.items():

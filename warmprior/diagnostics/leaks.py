@@ -51,11 +51,11 @@ class SourceLeak:
 
     Examples:
         >>> from warmprior.diagnostics import SourceLeak
-        >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
+        >>> leak = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
         ...                    inner_step=0.11, data_inner_step=0.1)
-        >>> round(found.leak, 2), round(found.inner_step_ratio, 2)
+        >>> round(leak.leak, 2), round(leak.inner_step_ratio, 2)
         (1.5, 1.1)
-        >>> found.warning
+        >>> leak.warning
         "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
     """
 

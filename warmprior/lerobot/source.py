@@ -82,10 +82,10 @@ class ChunkSource:
         ``before`` are the ``history_length`` actions before the current step; ``valid``, bool ``[B, *]``,
         marks those inside the episode.
         """
-        wanted = target[:, self.positions, : self.action_dim]
+        model_actions = target[:, self.positions, : self.action_dim]
         executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
         steps = valid.sum(1, keepdim=True)
-        history = window_history(executed, steps, wanted, self.prior.chunk_length)
+        history = window_history(executed, steps, model_actions, self.prior.chunk_length)
         if cold_probability > 0:
             draw = torch.rand(len(target), generator=generator, device=target.device)
             history = without(history, draw < cold_probability)

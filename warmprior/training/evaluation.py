@@ -259,9 +259,9 @@ def evaluate(
         if env.batch_size:
             _play_batched(policy, env, seeds, nfe, policy_seed, success, measures or {}, report)
         else:
-            wanted: dict[str, Any] = {"success": success, "measures": measures}
+            criteria: dict[str, Any] = {"success": success, "measures": measures}
             for seed in seeds:
-                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed, **wanted))
+                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed, **criteria))
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 
 

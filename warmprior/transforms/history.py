@@ -184,8 +184,8 @@ class HistoryObservation(EnvTransform):
         >>> from warmprior import GaussianPrior, HistoryObservation, policy_transforms
         >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
-        >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, and the flag
-        >>> seen.shape, seen[:, 0, -1].tolist(), 3 + HistoryObservation.width(2, action_dim=1)
+        >>> conditioned = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, and the flag
+        >>> conditioned.shape, conditioned[:, 0, -1].tolist(), 3 + HistoryObservation.width(2, action_dim=1)
         (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
     """
 
