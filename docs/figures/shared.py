@@ -33,6 +33,8 @@ SOURCES = {  # what a chart calls them, in which colour and with which mark
     "forecast": ("learned, of both", "0.2", "*"),
     "regression": ("regression", "0.2", "p"),
     "mip": ("MIP", "#a6761d", "s"),
+    "mip-past": ("MIP, WP-Past", "#a6761d", "D"),
+    "mip-past,correlation=0.5": ("MIP, WP-Past, correlated noise", "#a6761d", "P"),
 }
 WIDTH = 5.6  # of a picture, in inches: readable on a screen of 400 pixels
 OPERATORS = {"ph": "one operator", "mh": "six operators"}
