@@ -4,8 +4,8 @@ python benchmarks/budget.py                                          # square ph
 python benchmarks/budget.py --task can --budgets 2500 10000 --nfe 1
 python benchmarks/budget.py --resume                                 # after an interruption
 
-Every budget is a training of its own, with its own learning-rate schedule. The policies of robomimic.py
-with the same options are used, not trained again.
+Every budget is a separate training with its own learning-rate schedule. Policies that robomimic.py trained
+with the same options are reused.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from warmprior.training import TrainingConfig
 
 @dataclass(frozen=True)
 class BudgetOptions(MeasuredOptions):
-    """A comparison at several lengths of training."""
+    """Options of a comparison at several lengths of training."""
 
-    budgets: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)  # iterations, instead of --iterations
+    budgets: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)  # training lengths in place of --iterations
 
     def check(self) -> None:
         super().check()
@@ -40,7 +40,7 @@ class BudgetOptions(MeasuredOptions):
         check_given(self, "budgets")
 
     def trainings(self) -> list[TrainingConfig]:
-        """One per budget, the shortest first, each with its last policy alone."""
+        """Return a training per budget, the shortest first; each saves only its last policy."""
         budgets = sorted(set(self.budgets))
         return [replace(self.training, iterations=n, checkpoints=1) for n in budgets]
 
@@ -52,26 +52,26 @@ def main(argv: list[str] | None) -> None:
     options = parse(presets, argv, "budget", __doc__)
     with started(options, "budget") as out:
         policies = policies_of(options)
-        # Before the hours of training: what cannot be measured on is better known now.
+        # Before the training, so that data that cannot be measured on cost no hours.
         observations, source = held_out(options, policies[0])
         _, failures = compare(options, policies)
         error: dict[tuple[str, int], float] = {}
         for policy in (policy for policy in policies if policy.is_trained):
             actor, nfes = policy.load(), policy.method.nfes(options.evaluation.nfe)
             windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
-            found = action_error(actor, encoded_windows(actor, windows), nfes=nfes)
-            error |= {(policy.name, nfe): value for nfe, value in found.items()}
+            error_by_nfe = action_error(actor, encoded_windows(actor, windows), nfes=nfes)
+            error |= {(policy.name, nfe): value for nfe, value in error_by_nfe.items()}
         played = read_rows(out / "results.jsonl", PLAYED)
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
         rows = write_rows(out / "results.jsonl", measured)
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["iterations", "nfe"], ascending=[True, False], kind="stable")
-        lines = {"success": "success rate", "action_error": "squared error, held out"}
+        lines = {"success": "success rate", "action_error": "held-out squared error"}
         title = title_of(policies[0].task())
         plot_lines(seeds, out / "budget.png", title, "iterations", lines, scale="log")
         notes = [
-            f"Error: on {source}. It favours the average of all good actions, so it grows with NFE where the "
-            "data leave a choice."
+            f"Error: mean squared error on {source}. Where several actions are good, their average has the "
+            "smallest error, so the error grows with NFE."
         ]
         text = table(seeds, ["iterations", "nfe", "method"], ["success", "action_error"], notes)
         write_report(out, text, text, rows, failures)

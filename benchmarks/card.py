@@ -1,4 +1,4 @@
-"""The card of a policy with a run's results, for python -m warmprior push --card README.md.
+"""Print the model card of a policy with the results of a run, for python -m warmprior push --card README.md.
 
 python benchmarks/card.py runs/square-ph-quick runs/policies/square-ph-.../policy_010000 > README.md
 """
@@ -19,13 +19,16 @@ def main(argv: list[str] | None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, help="whose results the card tells")
-    parser.add_argument("folder", type=Path, help="of the policy")
-    parser.add_argument("--repository", default="user/name", help="where it will lie")
-    parser.add_argument("--licence", help="of the policy, as the hub calls it, such as mit")
-    a = parser.parse_args(argv)
-    results = policy_results(a.run, a.folder)
-    print(model_card(load_policy(a.folder), results, repository=a.repository, licence=a.licence))
+    parser.add_argument("run", type=Path, help="folder of the run whose results the card shows")
+    parser.add_argument("folder", type=Path, help="folder of the saved policy")
+    parser.add_argument(
+        "--repository", default="user/name", help="hub repository that the card names (default: %(default)s)"
+    )
+    parser.add_argument("--licence", help="licence of the policy in the hub's spelling, such as mit")
+    args = parser.parse_args(argv)
+    results = policy_results(args.run, args.folder)
+    card = model_card(load_policy(args.folder), results, repository=args.repository, licence=args.licence)
+    print(card)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""The paper's H = 1 study (Fig. 6), and all chunk lengths: success and jumps at chunk boundaries.
+"""The paper's H = 1 study (Fig. 6), extended to more chunk lengths: success, and jumps at chunk boundaries.
 
 python benchmarks/chunking.py                             # square ph, one seed, over an hour on two cores
 python benchmarks/chunking.py --chunk 1 8 --nfe 1 --task square transport --data ph mh    # the paper's figure
 python benchmarks/chunking.py --resume                    # after an interruption
 
-The policies of robomimic.py with the same options are used, not trained again.
+Policies that robomimic.py trained with the same options are reused.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def main(argv: list[str] | None) -> None:
         seeds = seeds.sort_values(["chunk", "nfe"], ascending=[True, False], kind="stable")
         lines = {"success": "success rate", JUMPS: "jump at boundaries (dotted: inside)"}
         settings = dict(list(seeds.groupby("setting", sort=False)))
-        for name, mine in settings.items():
+        for name, seeds_of_setting in settings.items():
             end = f"_{slug(name)}" if len(settings) > 1 else ""
-            plot_lines(mine, out / f"chunk_lengths{end}.png", name, "chunk", lines)
-        # All tasks beside each other, at the fewest network evaluations.
+            plot_lines(seeds_of_setting, out / f"chunk_lengths{end}.png", name, "chunk", lines)
+        # All tasks side by side, at the fewest network evaluations.
         fewest, shortest = at_fewest(seeds), min(seeds.chunk)
         title = f"NFE {min(seeds.nfe)}, {options.evaluation.seeds} seed(s)"
         pair = fewest[fewest.chunk.isin((shortest, PAPER_CHUNK))]

@@ -1,7 +1,7 @@
 """Curvature of the flow (the paper's Table 2 and Fig. 4): how straight each source makes it.
 
 python benchmarks/curvature.py --run runs/square-ph-quick     # the policies of a finished run
-python benchmarks/curvature.py --data mh --preset cpu         # of these options, trained if they are not yet
+python benchmarks/curvature.py --data mh --preset cpu         # policies of these options, trained first
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from warmprior.diagnostics import encoded_windows, flow_paths
 
 @dataclass(frozen=True)
 class CurvatureOptions(MeasuredOptions):
-    """What to measure."""
+    """Options of the curvature study."""
 
-    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
+    policies: FinishedRun = None  # folder of a finished run whose policies to measure (default: train them)
 
     @property
     def name(self) -> str:
@@ -47,7 +47,7 @@ def main(argv: list[str] | None) -> None:
         if run is not None and len({policy.training.seed for policy in policies}) < options.evaluation.seeds:
             raise ValueError(f"--run {run} has fewer seeds than --seeds {options.evaluation.seeds}")
         policies = [policy for policy in policies if policy.training.seed in options.seeds]
-        # Before the training: what cannot be measured is better known now.
+        # Before the training, so that data that cannot be measured on cost no hours.
         observations, source = held_out(options, policies[0])
         if run is None:
             train_all(options, policies)
@@ -72,12 +72,12 @@ def main(argv: list[str] | None) -> None:
         notes = [
             f"{setting_title(task)}, {len(observations)} observations of {source}, {seeds} seed(s). In "
             "brackets: 95% bootstrap intervals over episodes.",
-            "The paper says neither which mean it uses, nor whether it counts a prediction of 2H whole.",
-            "Curvature shrinks with the length of the transport. Divided by the squared mean velocity, it "
-            "does not.",
+            "The paper does not say which mean it uses, nor whether it averages over all 2H positions.",
+            "Shorter paths have less curvature. Curvature divided by the squared mean velocity does not "
+            "depend on their length.",
         ]
         chosen = labelled(pooled(rows))
-        if chosen.prior.iloc[0] == "gaussian":  # to which the ratios are
+        if chosen.prior.iloc[0] == "gaussian":  # the paper's ratios are to the Gaussian source
             chosen = chosen.assign(
                 paper_ratio=[paper_curvature(task | row) for row in chosen.to_dict("records")]
             )

@@ -1,4 +1,4 @@
-"""Demonstrations of the benchmarks' tasks as files.
+"""Generate, download or render the demonstrations of the benchmarks' tasks.
 
 python benchmarks/demonstrations.py generate lift --n 100 --out lift.hdf5     # by a scripted expert
 python benchmarks/demonstrations.py download square mh                        # the official ones
@@ -27,33 +27,34 @@ def main(argv: list[str] | None) -> None:
 
     add = commands.add_parser("generate", help="generate scripted demonstrations").add_argument
     add("task", choices=list(EXPERTS))
-    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
-    add("--n", type=int, default=200, help="how many (%(default)s)")
-    add("--out", type=Path, help="HDF5 file (default: in the cache)")
-    add("--overwrite", action="store_true", help="replace the file if it is there")
+    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (default: %(default)s)")
+    add("--n", type=int, default=200, help="number of demonstrations (default: %(default)s)")
+    add("--out", type=Path, help="HDF5 file to write (default: in the cache)")
+    add("--overwrite", action="store_true", help="replace an existing file")
 
     add = commands.add_parser("download", help="download the official file of a task").add_argument
     add("task", choices=list(OFFICIAL))
-    add("data", nargs="?", help="style (default: the first there is)")
-    add("--force", action="store_true", help="also if it is here")
+    add("data", nargs="?", help="style, such as ph or mh (default: the first that is published)")
+    add("--force", action="store_true", help="download again, even if the file is in the cache")
 
     add = commands.add_parser(
-        "render", help="render states to images; continues where it stopped"
+        "render", help="render states to images, or continue an interrupted rendering"
     ).add_argument
     add("file", type=Path, help="robomimic HDF5 file with states")
-    add("--cameras", nargs="+", help="of the simulator (default: those of the task)")
-    add("--size", type=int, default=84, help="side of the images in pixels (%(default)s)")
-    add("--fast", action="store_true", help="no reflections, shadows and smooth edges")
-    add("--out", type=Path, help="HDF5 file, also FILE itself (default: in the cache)")
-    add("--workers", type=int, help="processes (default: one per core)")
+    add("--cameras", nargs="+", help="cameras of the simulator (default: the task's)")
+    add("--size", type=int, default=84, help="side of the images in pixels (default: %(default)s)")
+    add("--fast", action="store_true", help="render without reflections, shadows and smooth edges")
+    add("--out", type=Path, help="HDF5 file to write, which may be FILE itself (default: in the cache)")
+    add("--workers", type=int, help="number of processes (default: one per core)")
 
-    a = parser.parse_args(argv)
-    if a.command == "generate":
-        print(generate_demonstrations(a.task, a.data, a.n, path=a.out, overwrite=a.overwrite))
-    elif a.command == "download":
-        print(download_robomimic(a.task, a.data, force=a.force))
+    args = parser.parse_args(argv)
+    if args.command == "generate":
+        print(generate_demonstrations(args.task, args.data, args.n, path=args.out, overwrite=args.overwrite))
+    elif args.command == "download":
+        print(download_robomimic(args.task, args.data, force=args.force))
     else:
-        print(render_demonstrations(a.file, a.cameras, a.size, fast=a.fast, out=a.out, workers=a.workers))
+        rendering = {"fast": args.fast, "out": args.out, "workers": args.workers}
+        print(render_demonstrations(args.file, args.cameras, args.size, **rendering))
 
 
 if __name__ == "__main__":

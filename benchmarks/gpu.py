@@ -1,9 +1,9 @@
-"""Everything that needs a GPU, in parts of a few minutes; each writes a row, and is skipped the next time.
+"""Everything that needs a GPU, in parts of a few minutes; a part that has written its row is skipped.
 
-python benchmarks/gpu.py                              # what has no row of this commit and these options
-python benchmarks/gpu.py --part 0                     # demonstrations, to take along; needs no GPU
+python benchmarks/gpu.py                              # parts without a row of this commit and these options
+python benchmarks/gpu.py --part 0                     # the demonstrations, which need no GPU
 python benchmarks/gpu.py --part 4 --prior gaussian past --minutes 15
-python benchmarks/gpu.py --device cpu --smallest      # tries this script, without a GPU
+python benchmarks/gpu.py --device cpu --smallest      # try this script without a GPU
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from warmprior.io.files import check_writable, write_atomic
 
 ROOT = Path(__file__).parents[1]
 PROBE, TINY_PROBE = 300, 6
-"""Iterations that tell how many fit into the time, and in the smallest form."""
+"""Iterations of the short training that tells how many fit into the time, usually and with --smallest."""
 
 BEFORE_PLAYING, ALONE = 0.75, 0.9
-"""Shares of a part's time that its trainings take."""
+"""Share of a part's time for its trainings, if episodes follow and if not."""
 
 DEMONSTRATIONS = {"state": 100, "image": 6}
-"""The numbers of demonstrations to make; with their images they take less than 60 MiB."""
+"""Number of demonstrations to generate; with their images they take less than 60 MiB."""
 
 SMALLEST: dict[str, dict[str, Any]] = {
     "data": {"demonstrations": (3,), "image_size": 32, "fast_rendering": True},
@@ -59,18 +59,19 @@ SMALLEST: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class GpuOptions:
-    """Parts to run, their policies, and their time."""
+    """Options of this script: the parts to run, their policies, and their time."""
 
-    # 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5 from images (default: all)
+    # parts to run: 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5 from images
+    # (default: all)
     part: tuple[int, ...] = ()
-    minutes: float | None = None  # that each may take (default: 3 to 7.5)
-    preset: str = "paper"  # of robomimic.py: network and recipe of parts 4 and 5
-    prior: tuple[str, ...] = ("past",)  # their methods, which share the time
-    episodes: int = 20  # of part 4, per method and NFE
-    device: str = "cuda"
-    smallest: bool = False  # tiny trainings on lift, which try this script
-    out: Path = Path("runs/gpu")  # where rows, policies and, without $WARMPRIOR_CACHE, demonstrations lie
-    commit: str | None = None  # of these sources (default: as git says)
+    minutes: float | None = None  # time limit of a part in minutes (default: 3 to 7.5)
+    preset: str = "paper"  # preset of robomimic.py for network and recipe of parts 4 and 5
+    prior: tuple[str, ...] = ("past",)  # methods of parts 4 and 5, which share the time
+    episodes: int = 20  # evaluation episodes of part 4, per method and NFE
+    device: str = "cuda"  # device of networks and data, such as cuda
+    smallest: bool = False  # run tiny trainings on lift, to try this script
+    out: Path = Path("runs/gpu")  # output folder; also the cache unless $WARMPRIOR_CACHE is set
+    commit: str | None = None  # name of this version of the code (default: git describe)
 
     def check(self) -> None:
         for number in self.part:
@@ -86,7 +87,7 @@ class GpuOptions:
         return TINY_PROBE if self.smallest else PROBE
 
     def policies(self, obs: str, iterations: int = 1, first: bool = False) -> tuple[Options, list[Policy]]:
-        """The preset's policies, trained for so many iterations; image encoders begin with random weights."""
+        """Return the preset's policies for a number of iterations; encoders start from random weights."""
         changes: dict[str, dict[str, Any]] = {
             "data": {"obs": obs, "demonstrations": (DEMONSTRATIONS[obs],)},
             "network": {"encoder": "resnet18"},
@@ -106,22 +107,23 @@ class GpuOptions:
 
 def inputs(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Read or make the demonstrations of parts 4 and 5."""
-    found = {obs: o.policies(obs)[1][0].task().facts for obs in DEMONSTRATIONS}
-    return {obs: {name: facts[name] for name in ("demonstrations", "steps")} for obs, facts in found.items()}
+    facts_by_obs = {obs: o.policies(obs)[1][0].task().facts for obs in DEMONSTRATIONS}
+    kept = ("demonstrations", "steps")
+    return {obs: {name: facts[name] for name in kept} for obs, facts in facts_by_obs.items()}
 
 
 def tests(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Run the tests that are marked `cuda`."""
-    # Only their files: to collect the others takes a minute, and packages that this machine may lack.
+    # Only their files: collecting the others takes a minute, and packages that this machine may lack.
     files = [path for path in (ROOT / "tests").rglob("test_*.py") if "pytest.mark.cuda" in path.read_text()]
     report = (o.out / "tests.xml").absolute()
     command = [sys.executable, "-m", "pytest", "-q", "-m", "cuda", f"--junitxml={report}", *map(str, files)]
     try:
         code = subprocess.run(command, cwd=ROOT, timeout=seconds, check=False).returncode
     except subprocess.TimeoutExpired:
-        raise PartialFailure(f"the tests take more than {seconds / 60:g} minutes: add --minutes") from None
+        raise PartialFailure(f"the tests take more than {seconds / 60:g} minutes: raise --minutes") from None
     if code not in (0, 1):  # all passed, or some failed
-        raise PartialFailure(f"the tests did not run, pytest ended with {code}: see above")
+        raise PartialFailure(f"the tests did not run: pytest ended with code {code}; its output is above")
     cases = list(ElementTree.parse(report).iter("testcase"))
     failed = [case.get("name") for case in cases if {"failure", "error"} & {part.tag for part in case}]
     skipped = sum(case.find("skipped") is not None for case in cases)
@@ -139,20 +141,20 @@ def ratios(o: GpuOptions, seconds: float) -> dict[str, Any]:
 
 
 def speed(o: GpuOptions, seconds: float) -> dict[str, Any]:
-    """Measure `cuda_steps_per_second` of throughput.py: of the paper's transformer."""
+    """Measure training steps per second of the paper's transformer: `cuda_steps_per_second`."""
     tiny: dict[str, Any] = {"network": throughput.small_network, "batch": 4} if o.smallest else {}
     return throughput.steps_per_second(clock(o), o.device, **tiny) or {}
 
 
 def train_for(o: GpuOptions, seconds: float, obs: str) -> tuple[Options, list[Policy]]:
-    """Train a policy per method, for as many iterations as a short training says fit."""
+    """Train a policy per method, for as many iterations as fit, by the speed of a short training."""
     begun = time.monotonic()
-    shutil.rmtree(o.out / obs, ignore_errors=True)  # of a part that was cut off: its logs would mislead
+    shutil.rmtree(o.out / obs, ignore_errors=True)  # logs of an interrupted part would mislead
     options, probes = o.policies(obs, o.probe, first=True)
     starts = time.monotonic()
     train_all(options, probes)
     rate = iterations_per_second(probes[0])
-    starting = time.monotonic() - starts - o.probe / rate  # a process, its compiler
+    starting = time.monotonic() - starts - o.probe / rate  # seconds to start a process and to compile
     left = seconds - (time.monotonic() - begun)
     fit = 0 if o.smallest and o.minutes is None else int(rate * (left / len(o.prior) - starting))
     options, policies = o.policies(obs, max(o.probe, fit))
@@ -161,7 +163,7 @@ def train_for(o: GpuOptions, seconds: float, obs: str) -> tuple[Options, list[Po
 
 
 def iterations_per_second(policy: Policy) -> float:
-    """The median over the training's log, without its first entry, in which it compiles."""
+    """Return the median over the training's log, without its first entry, in which it compiles."""
     path = policy.run.folder / "logs" / policy.name / "scalars/train/iterations_per_second.csv"
     return statistics.median(float(line.split(",")[1]) for line in path.read_text().splitlines()[1:])
 
@@ -169,12 +171,12 @@ def iterations_per_second(policy: Policy) -> float:
 def training_facts(policy: Policy) -> dict[str, Any]:
     """Return the speed and losses of a training, with the policy's facts."""
     (_, first), *_, (_, last) = policy.losses
-    found = {"iterations_per_second": iterations_per_second(policy), "first_loss": first, "loss": last}
-    return {**policy.facts, "batch_size": policy.training.batch_size, **found}
+    measures = {"iterations_per_second": iterations_per_second(policy), "first_loss": first, "loss": last}
+    return {**policy.facts, "batch_size": policy.training.batch_size, **measures}
 
 
 def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
-    """Train from states, and play."""
+    """Train from states, and play episodes."""
     options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
     last = policies[0].training.iterations
     cells: dict[tuple[Policy, Cell], list[Any]] = {
@@ -186,9 +188,9 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + options.evaluation.episodes)
     with Jobs(options.run) as jobs:
         for ((policy, cell), episodes), i in product(cells.items(), range(0, len(seeds), EPISODES_PER_JOB)):
-            few = seeds[i : i + EPISODES_PER_JOB]
-            work = play, policy, cell, options.evaluation, few
-            jobs.submit(f"play {policy}, {cell}, from {few[0]}", *work, then=episodes.extend)
+            seeds_of_job = seeds[i : i + EPISODES_PER_JOB]
+            work = play, policy, cell, options.evaluation, seeds_of_job
+            jobs.submit(f"play {policy}, {cell}, from {seeds_of_job[0]}", *work, then=episodes.extend)
         if failures := jobs.wait():
             raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
     kept = ("prior", "nfe", "temperature", "episodes", "successes", "mean_steps")
@@ -205,7 +207,7 @@ def images(o: GpuOptions, seconds: float) -> dict[str, Any]:
 PARTS = dict(
     enumerate([(inputs, 7.5), (tests, 4.0), (ratios, 3.0), (speed, 3.0), (states, 7.5), (images, 5.0)])
 )
-"""By number: the function, and the minutes that it may take."""
+"""By number: the function, and its time limit in minutes."""
 
 
 def commit_of_sources() -> str:
@@ -213,7 +215,7 @@ def commit_of_sources() -> str:
     try:
         return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError) as error:
-        raise ValueError("git does not know these sources: name what they are with --commit") from error
+        raise ValueError("this is no git checkout: name the version of the code with --commit") from error
 
 
 @script("gpu.py", hint="the same command continues")
@@ -225,15 +227,15 @@ def main(argv: list[str] | None) -> None:
         check_device(o.device)
     check_writable(o.out)
     os.environ.setdefault("WARMPRIOR_CACHE", str((o.out / "inputs").absolute()))
-    asked = {name: value for name, value in asdict(o).items() if name not in ("part", "out", "commit")}
-    identity = {"commit": o.commit or commit_of_sources(), "options": json.loads(json.dumps(asked))}
+    recorded = {name: value for name, value in asdict(o).items() if name not in ("part", "out", "commit")}
+    identity = {"commit": o.commit or commit_of_sources(), "options": json.loads(json.dumps(recorded))}
     path, failures = o.out / "results.jsonl", []
     rows = read_lines(path) if path.exists() else []
     for number in parts:
         work, minutes = PARTS[number]
-        mine, name = {"part": number, **identity}, f"part {number}, {work.__name__}"
-        known = any(mine.items() <= found.items() for found in rows)
-        done = known and not identity["commit"].endswith("-dirty")
+        key, name = {"part": number, **identity}, f"part {number}, {work.__name__}"
+        has_row = any(key.items() <= row.items() for row in rows)
+        done = has_row and not identity["commit"].endswith("-dirty")
         print(f"{name}: done before" if done else name, flush=True)
         if done:
             continue
@@ -245,8 +247,8 @@ def main(argv: list[str] | None) -> None:
             print(f"FAILED {failures[-1]}", flush=True)
             continue
         facts = {"seconds": time.monotonic() - begun, **facts_of_machine()}
-        rows.append({**mine, **facts, "results": results})
-        text = "".join(json.dumps(found) + "\n" for found in rows)
+        rows.append({**key, **facts, "results": results})
+        text = "".join(json.dumps(row) + "\n" for row in rows)
         write_atomic(path, partial(Path.write_text, data=text))
         print(json.dumps(results), flush=True)
     print(f"Rows: {path}")

@@ -3,9 +3,9 @@
 python benchmarks/joint_targets.py --preset cpu --prior gaussian past preview past,correlation=0.5 --nfe 9 3 1
 python benchmarks/joint_targets.py --data mh --demonstrations 300
 
-A demonstration's joint positions one step on are the targets of a second arm, robosuite's JOINT_POSITION
-controller with absolute targets, as a follower arm gets those of its leader. What is recorded of the second
-arm, and solves the task, is the demonstration. Policies see the arm's joints, the gripper and the object.
+A second arm follows each scripted demonstration, as a follower arm follows its leader: its targets are the
+joint positions of the next step, tracked by robosuite's JOINT_POSITION controller. The second arm's motion is
+recorded as a demonstration if it solves the task. Policies see the arm's joints, the gripper and the object.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from warmprior.training import Task
 
 SQUARE, ARM = "square", "robot0_"
 OBSERVATION = ["object", f"{ARM}joint_pos", f"{ARM}gripper_qpos"]
-#: Stiffness, the most that robosuite's own limits allow: the arm is at a target within three control steps.
+#: The largest stiffness that robosuite allows; the arm reaches a target within three control steps.
 KP = 300
 
 
 def joint_env_args() -> dict[str, Any]:
-    """Square, whose actions are seven joint positions in radians and the gripper."""
+    """Return env_args of square whose actions are seven joint positions in radians and the gripper."""
     env_args = task_env_args(SQUARE)
     parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
     parts["right"] = {
@@ -51,13 +51,13 @@ def joint_env_args() -> dict[str, Any]:
 
 
 def followed(path: Path, loop: StepLoop) -> Iterator[Episode]:
-    """Demonstrations of the follower, of those in a file, if they solve the task."""
+    """Yield the follower's episode for each demonstration in a file, if it solves the task."""
     with open_robomimic(path) as file:
         names = selected_demos(file, None)
         for index, name in enumerate(tqdm(names, "joint targets", unit="demo")):
             demo = file[f"data/{name}"]
             joints = demo[f"next_obs/{ARM}joint_pos"][()]
-            # It holds the last target for as long as it lags behind.
+            # The last target is held for ten steps, because the arm lags behind.
             targets = np.concatenate([joints, np.repeat(joints[-1:], 10, 0)])
             fingers = demo["actions"][:, -1:]
             actions = np.concatenate([targets, np.pad(fingers, ((0, 10), (0, 0)), "edge")], -1)
@@ -75,8 +75,8 @@ def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
         robot.composite_controller.reset()
     for action in actions:
         states.append(loop.state())
-        observed, success = loop.step(action)
-        observations.append(observed)
+        observation, success = loop.step(action)
+        observations.append(observation)
         rewards.append(float(success))
         if sum(rewards[-6:]) == 6:
             break
@@ -88,12 +88,12 @@ def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
         actions=actions[: len(rewards)],
         states=np.stack(states),
         rewards=np.array(rewards),
-        observations={key: np.stack([each[key] for each in observations]) for key in observations[0]},
+        observations={key: np.stack([step[key] for step in observations]) for key in observations[0]},
     )
 
 
 def demonstrations(style: str, count: int) -> Path:
-    """The file of the follower's demonstrations, recorded if there is none yet."""
+    """Return the file of the follower's demonstrations; record it if it does not exist."""
     source = generate_demonstrations(SQUARE, style, count)
     path = source.with_name(f"{source.stem}_joint_targets.hdf5")
     if not path.exists():
@@ -106,10 +106,10 @@ def demonstrations(style: str, count: int) -> Path:
 
 
 def task(options: DataOptions) -> Task:
-    """The follower's demonstrations, and square under the same controller."""
+    """Return the task: the follower's demonstrations, and square under the same controller."""
     style = options.data[0]
     if style not in ("ph", "mh"):
-        raise ValueError(f"--data {style} has no scripted demonstrations: name ph or mh")
+        raise ValueError(f"--data {style} has no scripted demonstrations: choose ph or mh")
     path = demonstrations(style, options.count(style))
     return Task.open(
         path,

@@ -1,8 +1,8 @@
-"""Does memory help? Memory gain against success over the Gaussian source, from finished runs.
+"""Plot the gain in success over the first method against memory gain, from finished runs.
 
 python benchmarks/memory.py runs/square-ph-cpu runs/square-mh-cpu --out memory.png
 
-It trains and plays nothing: it reads `results.jsonl` of runs of robomimic.py (docs/benchmarks.md).
+It trains and plays nothing: it reads `results.jsonl` of runs of robomimic.py or pusht.py.
 """
 
 from __future__ import annotations
@@ -24,30 +24,33 @@ def main(argv: list[str] | None) -> None:
     """Read the runs, print a table and draw a point per task, method and NFE."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
-    parser.add_argument("--out", type=Path, default=Path("memory.png"), help="the picture")
+    out = Path("memory.png")
+    parser.add_argument("--out", type=Path, default=out, help="picture to write (default: %(default)s)")
     args = parser.parse_args(argv)
 
-    # A record per task, method and NFE, with everything that is known of it as a column.
+    # A row per setting, method and NFE.
     whose = "robomimic.py or pusht.py: name a run of these"
     tables = [pd.DataFrame(read_rows(run / "results.jsonl", PLAYED, whose)) for run in args.runs]
     for run, rows in zip(args.runs, tables, strict=True):
         if "memory_gain" not in rows:
-            raise ValueError(f"{run}: its rows have no memory_gain; name a run of robomimic.py or pusht.py")
-    found = pd.concat([summary(rows, top_k=1) for rows in tables])
-    found = found[found.memory_gain.notna() & found.gain.notna()]
-    if found.empty:
-        raise ValueError("these runs have no method beside their first one that was measured")
+            raise ValueError(f"{run} measured no memory_gain: name a run of robomimic.py or pusht.py")
+    summaries = [summary(rows, top_k=1) for rows in tables]
+    gains = pd.concat(summaries)
+    gains = gains[gains.memory_gain.notna() & gains.gain.notna()]
+    if gains.empty:
+        raise ValueError("no method of these runs has both a memory gain and a gain in success: add a run")
 
-    figure, (axis,) = new_figure(6.0, 4.0)
-    colors = colors_of(found)
-    for method, group in found.groupby("method", sort=False):
-        axis.scatter(group.memory_gain, 100 * group.gain, 18, color=colors[method], label=method)
+    figure, (axis,) = new_figure(4.0, 3.0)
+    colors = colors_of(gains)
+    for method, group in gains.groupby("method", sort=False):
+        axis.scatter(group.memory_gain, 100 * group.gain, 40, color=colors[method], label=method)
     axis.axhline(0, color="0.6", lw=0.8)
-    axis.set_xlabel("memory gain (0: ignores what it did, 1: repeats it)")
-    axis.set_ylabel("success over the first method (points)")
-    save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
+    axis.set_xlabel("memory gain (0: past ignored, 1: past copied)")
+    axis.set_ylabel("gain in success (points)")
+    firsts = dict.fromkeys(rows.method.iloc[0] for rows in summaries)
+    save(figure, args.out, f"Gain over {' or '.join(firsts)}", 12)
 
-    text = table(found, ["setting", "nfe", "method"], ["memory_gain", "gain"])
+    text = table(gains, ["setting", "nfe", "method"], ["memory_gain", "gain"])
     print(text, f"\nPicture: {args.out}", sep="")
 
 

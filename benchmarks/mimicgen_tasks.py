@@ -1,4 +1,4 @@
-"""The paper's Table 1 on MimicGen: ten demonstrations of Stack, Coffee and Threading, from images.
+"""The paper's Table 1 on MimicGen: Stack, Coffee and Threading from images, ten demonstrations each.
 
 python benchmarks/mimicgen_tasks.py                              # robosuite's Stack, scripted, from state
 python benchmarks/mimicgen_tasks.py --download --preset paper --device cuda --out runs/mimicgen
@@ -6,8 +6,8 @@ python benchmarks/mimicgen_tasks.py --download --task coffee_d0 --data core --de
 python benchmarks/mimicgen_tasks.py --resume --out runs/mimicgen # after an interruption
 
 With --download or --dataset the tasks are MimicGen's own, stack_d0, coffee_d0 and threading_d0, and need its
-package (docs/data.md). Its data have the licence CC BY-NC-SA 4.0. (A script called mimicgen.py would be in
-the way of that package: Python looks for modules beside a script first.)
+package (docs/data.md). Its data have the licence CC BY-NC-SA 4.0. This script is not called mimicgen.py,
+because Python would then import it in place of that package.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from lab.command_line import script
 from lab.options import Options, with_parts
 from lab.presets import IMAGES, PRESETS, adapted
 
-LARGE = ("paper", "much-ado")  # presets for a GPU, which see images
+LARGE = ("paper", "much-ado")  # presets for a GPU, whose policies see images
 
 
 def few(name: str, preset: Options) -> Options:
-    """A preset for the paper's number of demonstrations, with a training for so few."""
+    """Return a preset with the paper's ten demonstrations, and a training of suitable length."""
     large = name in LARGE
     return with_parts(
         with_parts(preset, **IMAGES[name]) if large else preset,
@@ -36,12 +36,12 @@ def few(name: str, preset: Options) -> Options:
 FEW = {name: few(name, preset) for name, preset in PRESETS.items()}
 
 
-def adapt(preset: Options, asked: Options) -> Options:
-    """Without a file the task is robosuite's Stack, which has a scripted expert."""
-    chosen = adapted(preset, asked)
-    if asked.data.generated:
+def adapt(preset: Options, typed: Options) -> Options:
+    """Return the preset for MimicGen's own tasks if there is a file, else for robosuite's Stack."""
+    chosen = adapted(preset, typed)
+    if typed.data.generated:
         return chosen
-    tasks = () if asked.data.dataset else ("stack_d0", "coffee_d0", "threading_d0")
+    tasks = () if typed.data.dataset else ("stack_d0", "coffee_d0", "threading_d0")
     return with_parts(chosen, data={"task": tasks, "data": ("source",)})
 
 

@@ -37,9 +37,9 @@ STEPS = 32  # half of an episode: the longest chunk
 
 @dataclass(frozen=True)
 class NavigationOptions(Options):
-    """A comparison of sources on the toy; its episodes are rollouts."""
+    """Options of a comparison of sources on the toy; --episodes is the number of rollouts."""
 
-    position_only: bool = False  # policies see the position without its sines and cosines, as in the paper
+    position_only: bool = False  # show policies the position without its sines and cosines, as in the paper
 
     @property
     def name(self) -> str:
@@ -49,7 +49,9 @@ class NavigationOptions(Options):
         super().check()
         check_single(self, "chunk")
         if self.data != DataOptions():
-            raise ValueError("the toy has demonstrations of its own: leave out --task, --data and their like")
+            raise ValueError(
+                "the toy has its own demonstrations: leave out --task, --data and other options of data"
+            )
         if self.sources.chunk[0] > STEPS:
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
 
@@ -74,8 +76,8 @@ NAVIGATION_PRESETS = {
         sources=SOURCES,
         evaluation=PLAYED,
     ),
-    # Fig. 5: four layers of 1,024 units that see the position. Of the recipe the paper has no more than the
-    # iterations and the batch size; the rest is that of its robot tasks.
+    # Fig. 5: four layers of 1,024 units that see the position. The paper gives only iterations and batch
+    # size; the rest of the recipe is that of its robot tasks.
     "paper": NavigationOptions(
         position_only=True,
         network=NetworkOptions("plain_mlp", hidden_dim=1024, precondition=False, observation_steps=1),
@@ -89,7 +91,7 @@ NAVIGATION_PRESETS = {
 @script("navigation1d.py", together=True)
 def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
-    options = parse(NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base)
+    options = parse(NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, typed: base)
     with started(options, "navigation1d") as out:
         style = "position" if options.position_only else "toy"
         policies = policies_of(options, ("navigation", style), only=True)
@@ -105,20 +107,20 @@ def main(argv: list[str] | None) -> None:
         observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
         flows = []
         for seed in options.seeds:  # the source samples belong to the seed
-            mine = [policy for policy in policies if policy.training.seed == seed]
-            actors = trained_actors(mine, options.run.device)
+            policies_of_seed = [policy for policy in policies if policy.training.seed == seed]
+            actors = trained_actors(policies_of_seed, options.run.device)
             flows += straightness(actors, observations, draws=4, seed=seed)
         curvatures = write_rows(out / "curvature.jsonl", flows)
         notes = unlike(options, NAVIGATION_PRESETS["paper"])
         if not options.position_only:
-            notes.append("Unlike in the paper, policies see sines and cosines beside the position.")
+            notes.append("Unlike in the paper, policies also see sines and cosines of the position.")
         text = table(labelled(rows), ["method", "nfe"], JUDGED, notes)
         flow = labelled(curvatures[curvatures["mean"] == "training"])
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])
-        # Before the pictures, which are the lesser loss: the trainings took the time.
+        # Before the pictures, so that an error in drawing loses no results.
         write_report(out, text, text, pd.concat([rows, curvatures]))
 
-        # What the policies of the first seed execute, and the paths of their flows.
+        # Executed actions and flow paths of the first seed's policies.
         seed, chunk = options.training.seed, options.sources.chunk[0]
         panels, paths = {}, {}
         shown = labelled(rows).set_index(["policy", "nfe"])
@@ -126,13 +128,13 @@ def main(argv: list[str] | None) -> None:
             method, actor = policy.method, policy.load()
             nfe = max(method.nfes(options.evaluation.nfe))
             row = shown.loc[policy.name, nfe]
-            said = [f"collides {row.collision_rate:.0%}"]
+            captions = [f"collides {row.collision_rate:.0%}"]
             if pd.notna(row.switch_rate):
-                said[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {said[0]}"
+                captions[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {captions[0]}"
             if method.remembers:
-                said.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
+                captions.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
             rollout = play_navigation(actor, seed, nfe=nfe, make_env=make_env)
-            panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), said)
+            panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), captions)
             if method.is_flow:
                 # One window of a demonstration, above the first obstacle, from many source samples.
                 window = observations.windows(actor.prior, see_history=method.parts.sees_history)

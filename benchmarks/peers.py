@@ -1,16 +1,15 @@
-"""Training and inference beside LeRobot's and TorchRL's policies: the same windows, networks of equal size.
+"""Speed of training and inference compared with LeRobot and TorchRL, on the same windows at equal size.
 
 python benchmarks/peers.py                                   # minutes on two cores
 python benchmarks/peers.py --device cuda --batch-size 1024
 
 Peers run as their packages ship them, in one process and on one thread (on a CPU), with the same
-optimiser. Every training step takes a batch from the same replay buffer of windows; what a peer's own data
-loader costs is left out. What is not installed is skipped by name.
+optimiser. Every training step takes a batch from the same replay buffer of windows, so the cost of a peer's
+own data loader is left out. Peers that are not installed are skipped.
 
-Equal parameters are not equal work. Of the 18.5 M of multi_task_dit, 7.4 M multiply a constant and 10.9 M
-are used once per sample. So the table has GFLOP/s as well, which compares at equal operations: those of
-the loss, or of the network alone where those of a loss cannot be counted. Dropout differs between the
-networks, and each keeps its own.
+Equal parameters are not equal work. Of the 18.5 M parameters of multi_task_dit, 7.4 M multiply a constant and
+10.9 M are used once per sample. So the table also has GFLOP/s, counted in the loss, or in the network alone
+where the operations of a loss cannot be counted. Every network keeps its own dropout.
 """
 
 from __future__ import annotations
@@ -55,23 +54,23 @@ type Batch = TensorDictBase
 
 @dataclass
 class Peer:
-    """A policy to be measured."""
+    """A policy to measure."""
 
     name: str
-    module: nn.Module  # what is trained
-    loss: Callable[[Batch], torch.Tensor]  # of a batch of windows
+    module: nn.Module  # the module that is trained
+    loss: Callable[[Batch], torch.Tensor]  # the loss of a batch of windows
     decide: Callable[[int], object]  # makes a chunk for one observation, at a number of network evaluations
-    own_steps: int  # the number of evaluations that the package would take
-    network_pass: Callable[[Batch], torch.Tensor] | None = None  # where a loss's operations are not counted
+    own_steps: int  # network evaluations per chunk by default in its package
+    network_pass: Callable[[Batch], torch.Tensor] | None = None  # counted in place of the loss
 
     @property
     def parameters(self) -> int:
-        """How many are trained."""
+        """Return the number of trained parameters."""
         return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
 
 
 def ours(kind: type[VelocityNetwork], option: str, width: int, device: str) -> Peer:
-    """FlowMatchingLoss on one of this library's networks, whose option for the width has a name."""
+    """Return FlowMatchingLoss on one of this library's networks; ``option`` names its width."""
     network = kind(D_A, D_O, H, TO, **{option: width}).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
@@ -89,7 +88,7 @@ def ours(kind: type[VelocityNetwork], option: str, width: int, device: str) -> P
 
 
 def torchrl(width: int, device: str) -> Peer:
-    """DiffusionBCLoss and DiffusionActor on a chunk in one vector, with an MLP."""
+    """Return DiffusionBCLoss and DiffusionActor with an MLP; the chunk is one vector."""
     from torchrl.modules import MLP, DiffusionActor
     from torchrl.objectives import DiffusionBCLoss
 
@@ -104,7 +103,7 @@ def torchrl(width: int, device: str) -> Peer:
     actors = {nfe: actor(nfe) for nfe in (*NFES, 100)}
     data = TensorDict({"observation": torch.randn(1, observed)}, [1]).to(device)
 
-    def of(batch: Batch) -> torch.Tensor:
+    def chunk_loss(batch: Batch) -> torch.Tensor:
         action = batch["vla_action", "chunk"].flatten(1)
         flat = {"observation": batch["observation"].flatten(1), "action": action}
         return loss(TensorDict(flat, batch.batch_size))["loss_diffusion_bc"]
@@ -112,7 +111,7 @@ def torchrl(width: int, device: str) -> Peer:
     return Peer(
         "torchrl: DiffusionBCLoss, MLP",
         network,
-        of,
+        chunk_loss,
         lambda nfe: actors[nfe](data.copy()),
         100,
         lambda batch: network(torch.zeros(len(batch), inputs, device=device)),
@@ -120,7 +119,7 @@ def torchrl(width: int, device: str) -> Peer:
 
 
 def features(objects: bool, device: str) -> dict[str, Any]:
-    """What LeRobot's configurations know of the windows."""
+    """Return the features and lengths that LeRobot's configurations take."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     state = VECTOR if objects else D_O
@@ -136,48 +135,48 @@ def features(objects: bool, device: str) -> dict[str, Any]:
 def lerobot(
     name: str,
     policy: Any,
-    seen: Callable[[torch.Tensor], dict[str, torch.Tensor]],
+    to_batch: Callable[[torch.Tensor], dict[str, torch.Tensor]],
     set_steps: Callable[[int], None],
     device: str,
 ) -> Peer:
-    """A policy of LeRobot's; `seen` names the parts of observations as it does."""
-    now = seen(torch.randn(1, D_O, device=device))
+    """Return a policy of LeRobot; ``to_batch`` maps observations to its keys."""
+    observation = to_batch(torch.randn(1, D_O, device=device))
 
     def loss(batch: Batch) -> torch.Tensor:
         target = {"action": batch["vla_action", "chunk"], "action_is_pad": batch["action_is_pad"]}
-        return policy(seen(batch["observation"]) | target)[0]
+        return policy(to_batch(batch["observation"]) | target)[0]
 
     def decide(nfe: int) -> None:
         set_steps(nfe)
         policy.reset()
-        policy.select_action(dict(now))
+        policy.select_action(dict(observation))
 
     return Peer(name, policy, loss, decide, 100)
 
 
 def lerobot_diffusion(width: int, device: str) -> Peer:
-    """LeRobot's Diffusion Policy: a U-Net over the chunk, conditioned on state vectors."""
+    """Return LeRobot's Diffusion Policy: a U-Net over the chunk, conditioned on state vectors."""
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     dims = (width, 2 * width, 4 * width)
     policy = DiffusionPolicy(DiffusionConfig(**features(True, device), down_dims=dims)).to(device)
 
-    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+    def to_batch(observation: torch.Tensor) -> dict[str, torch.Tensor]:
         parts = observation.split((VECTOR, OBJECTS), dim=-1)
         return dict(zip(("observation.state", "observation.environment_state"), parts, strict=True))
 
     set_steps = partial(setattr, policy.diffusion, "num_inference_steps")
-    return lerobot("lerobot: diffusion (U-Net)", policy, seen, set_steps, device)
+    return lerobot("lerobot: diffusion (U-Net)", policy, to_batch, set_steps, device)
 
 
 def lerobot_multi_task_dit(width: int, device: str) -> Peer:
-    """LeRobot's multi_task_dit with flow matching, behind a language encoder that costs next to nothing."""
+    """Return LeRobot's multi_task_dit with flow matching and a tiny language encoder."""
     from lerobot.policies.multi_task_dit import modeling_multi_task_dit as modeling
     from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
     from transformers import CLIPTextConfig
 
-    # Its own comes with weights from a hub; this one is two layers of width 32, with random ones.
+    # Its own encoder needs weights from a hub; this one has two layers of width 32 and random weights.
     sizes: dict[str, Any] = {
         "vocab_size": 64,
         "hidden_size": 32,
@@ -193,17 +192,17 @@ def lerobot_multi_task_dit(width: int, device: str) -> Peer:
         config = MultiTaskDiTConfig(**features(False, device), **flow)
         policy = modeling.MultiTaskDiTPolicy(config).to(device)
 
-    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+    def to_batch(observation: torch.Tensor) -> dict[str, torch.Tensor]:
         token = torch.ones(len(observation), 1, dtype=torch.bool, device=device)
         language = {"tokens": 0 * token.long(), "attention_mask": token}
         named = {f"observation.language.{name}": value for name, value in language.items()}
         return {"observation.state": observation, **named}
 
     set_steps = partial(setattr, policy.config, "num_integration_steps")
-    return lerobot("lerobot: multi_task_dit", policy, seen, set_steps, device)
+    return lerobot("lerobot: multi_task_dit", policy, to_batch, set_steps, device)
 
 
-# How to build each, its width for 20M parameters, and the packages that it needs.
+# By name: a constructor, the width for 20M parameters, and the packages that it needs.
 PEERS: dict[str, tuple[Callable[[int, str], Peer], int, tuple[str, ...]]] = {
     "warmprior_transformer": (partial(ours, ChiTransformer, "embedding_dim"), 384, ()),  # the paper's network
     "warmprior_adaln": (partial(ours, AdaLNTransformer, "embedding_dim"), 360, ()),
@@ -215,7 +214,7 @@ PEERS: dict[str, tuple[Callable[[int, str], Peer], int, tuple[str, ...]]] = {
 
 
 def training_step(peer: Peer, sample: Callable[[], Batch]) -> Callable[[], object]:
-    """A step: windows, loss, backward, optimiser."""
+    """Return a training step: sample windows, loss, backward, optimiser."""
     trained = [p for p in peer.module.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, fused=True)
 
@@ -230,7 +229,7 @@ def training_step(peer: Peer, sample: Callable[[], Batch]) -> Callable[[], objec
 
 
 def flop_of(peer: Peer, batch: Batch) -> int:
-    """Floating-point operations of a training step, without the optimiser."""
+    """Return the floating-point operations of a training step, without the optimiser."""
     compute = peer.loss if peer.network_pass is None else peer.network_pass
     with FlopCounterMode(display=False) as counter:
         compute(batch).sum().backward()
@@ -262,14 +261,14 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
     return rows
 
 
-def draw(path: Path, found: pd.DataFrame) -> None:
+def draw(path: Path, rows: pd.DataFrame) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
-    colors = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(found)]
-    speed.barh(found.index.str.replace(": ", ":\n"), found.samples_per_second, color=colors)
+    colors = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(rows)]
+    speed.barh(rows.index.str.replace(": ", ":\n"), rows.samples_per_second, color=colors)
     speed.set(xlabel="training, samples/s")
     speed.invert_yaxis()
-    for (_, row), color in zip(found.iterrows(), colors, strict=True):  # of the bars, which name them
+    for (_, row), color in zip(rows.iterrows(), colors, strict=True):  # the bars are the legend
         latency.plot(NFES, row[[f"latency_nfe_{nfe}" for nfe in NFES]], "o-", color=color)
     latency.set(xlabel="network evaluations per chunk", ylabel="latency of a chunk, ms")
     latency.set(yscale="log", xticks=NFES)
@@ -281,11 +280,11 @@ def run(argv: Sequence[str] | None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--peers", nargs="+", default=list(PEERS), choices=PEERS, help="default: all")
-    add("--batch-size", type=int, default=256, help="windows (%(default)s)")
-    add("--repeats", type=int, default=5, help="rounds (%(default)s)")
-    add("--device", default="cpu", help="such as cuda (%(default)s)")
-    add("--out", type=Path, default=Path("runs/peers"), help="output folder (%(default)s)")
+    add("--peers", nargs="+", default=list(PEERS), choices=PEERS, help="policies to measure (default: all)")
+    add("--batch-size", type=int, default=256, help="windows per batch (default: %(default)s)")
+    add("--repeats", type=int, default=5, help="number of rounds (default: %(default)s)")
+    add("--device", default="cpu", help="device, such as cuda (default: %(default)s)")
+    add("--out", type=Path, default=Path("runs/peers"), help="output folder (default: %(default)s)")
     options = parser.parse_args(argv)
     if options.repeats < 1 or options.batch_size < 1:
         parser.error("--repeats and --batch-size must be at least 1")
@@ -295,7 +294,7 @@ def run(argv: Sequence[str] | None) -> None:
     for name in options.peers:
         make, width, packages = PEERS[name]
         if missing := [package for package in packages if not find_spec(package)]:
-            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
+            print(f"{name}: skipped, because it needs {' and '.join(missing)}: pip install 'warmprior[vla]'")
         else:
             peers.append(make(width, options.device))
     if not peers:
@@ -308,9 +307,9 @@ def run(argv: Sequence[str] | None) -> None:
     )
     text = json.dumps({"meta": meta, "rows": rows}, indent=2)
     (options.out / "peers.json").write_text(text + "\n")
-    found = pd.DataFrame(rows).set_index("policy")
-    draw(options.out / "peers.png", found)
-    print(found.T.to_string(float_format="{:,.2f}".format))
+    table = pd.DataFrame(rows).set_index("policy")
+    draw(options.out / "peers.png", table)
+    print(table.T.to_string(float_format="{:,.2f}".format))
     print(f"written to {options.out}")
 
 

@@ -5,7 +5,7 @@ python benchmarks/prior_space_rl.py                          # lift from a weak 
 python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
-A frozen policy per source and seed comes from --run (a finished run) or is trained first.
+There is a frozen policy per source and seed, from the finished run --run or trained first.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from warmprior.rl import PriorSpaceTraining
 
 TOY_PRESET = NAVIGATION_PRESETS["quick"]
 AGENT_PRESETS: dict[str, AgentsOptions] = {
-    # Lift from a weak policy, WP-Past against the base, two seeds: half an hour.
+    # Lift from a weak policy, WP-Past against the Gaussian source, two seeds: half an hour.
     "quick": AgentsOptions(
         network=PRESETS["quick"].network,
         training=PRESETS["quick"].training,
@@ -59,8 +59,8 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             learning_rate=1e-3,
             gamma=0.97,
             hidden_dim=128,
-            # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
-            # would be paid for not solving the task, until the temperature has fallen.
+            # At 1, the entropy bonus of 56 coordinates exceeds the reward of a decision's 8 control steps, so
+            # the agent would be rewarded for not solving the task until alpha has fallen.
             alpha_init=0.05,
             evaluate_every=6_000,
         ),
@@ -84,7 +84,7 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             gamma=1.0,
             hidden_dim=128,
             num_layers=2,
-            # Failure ends the episode: entropy in the targets would pay for not failing, whatever the reward.
+            # Failure ends the episode, so entropy in the targets would reward survival whatever the task.
             backup_entropy=False,
             alpha_init=0.02,
             reward_offset=0.0,
@@ -93,7 +93,8 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
         num_envs=32,
     ),
     # Fig. 7's four agents with DSRL's hyper-parameters per task, three seeds: needs a GPU. As in DSRL,
-    # success does not end the episode. The paper's policies have 3,000 epochs; these have Table 3's.
+    # success does not end the episode. The paper trains these policies for 3,000 epochs; here they have
+    # Table 3's length.
     "paper": study(
         AgentsOptions,
         PRESETS["paper"],
@@ -104,9 +105,9 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
     ),
 }
 
-# What a preset does differently on a task.
+# Changes of a preset for a task.
 BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
-    # Weak policies: solved in 0.3 to 0.8 of the episodes.
+    # Weak policies, which solve 30 to 80% of the episodes.
     ("quick", "lift"): {"data": {"demonstrations": (5,)}, "training": {"iterations": 300}, "horizon": 90},
     ("quick", "can"): {"training": {"iterations": 500}},
     ("paper", "lift"): {"rl": {"updates": 30}, "horizon": 300},
@@ -116,19 +117,19 @@ BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 
-def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
-    """The preset with the hyper-parameters of the task."""
-    name, given, run = asked.run.preset, asked.data.task, asked.policies
+def adapt(preset: AgentsOptions, typed: AgentsOptions) -> AgentsOptions:
+    """Return the preset with the hyper-parameters of the task."""
+    name, tasks, run = typed.run.preset, typed.data.task, typed.policies
     if name == "unit":
         return preset
     if run is not None and (run / "tasks.json").exists():
-        given = given or (read_json(run / "tasks.json")[0]["task"],)
-    elif name == "quick" and asked.data.dataset is None:
-        given = given or ("lift",)
-    if name == "paper" and not given:
-        raise ValueError("--preset paper has hyper-parameters per task: add the --task")
-    changed = with_parts(preset, **BY_TASK.get((name, next(iter(given), "")), {}))
-    return with_parts(changed, data={"task": given})
+        tasks = tasks or (read_json(run / "tasks.json")[0]["task"],)
+    elif name == "quick" and typed.data.dataset is None:
+        tasks = tasks or ("lift",)
+    if name == "paper" and not tasks:
+        raise ValueError("--preset paper has hyper-parameters per task: add --task")
+    changed = with_parts(preset, **BY_TASK.get((name, next(iter(tasks), "")), {}))
+    return with_parts(changed, data={"task": tasks})
 
 
 def learn(
@@ -143,7 +144,7 @@ def learn(
         from lab.ray_collection import ray_rounds
 
         rounds = partial(ray_rounds, collectors=options.collectors, address=options.run.ray_address)
-    encoders = encoding(actor)  # one that sees images reads their features, as the agent does
+    encoders = encoding(actor)  # a policy of images reads the same features as the agent
     training = PriorSpaceTraining(
         actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
         partial(environment, actor, options.is_toy, options.num_envs, parts),
@@ -153,7 +154,7 @@ def learn(
         description=name,
         collect=rounds,
     )
-    with torch_threads(1):  # workers that end set it otherwise
+    with torch_threads(1):  # TorchRL resets the number of threads when workers end
         training.run()
     return training
 
@@ -182,7 +183,7 @@ def main(argv: list[str] | None) -> None:
             }
             try:
                 training = learn(options, actor, arm, seed, out)
-            except FloatingPointError as error:  # no reason to keep the other agents from learning
+            except FloatingPointError as error:  # the other agents are still trained
                 failures.append(f"{arm}, seed {seed}: {error}")
                 continue
             rows = [row for row in rows if not facts.items() <= row.items()]
@@ -190,25 +191,25 @@ def main(argv: list[str] | None) -> None:
             write_rows(path, rows)
         if not rows:
             raise FloatingPointError("; ".join(failures))
-        found = labelled(write_rows(path, rows))
-        if found.groupby("method")["delta"].nunique().max() > 1:
-            found["method"] += ", delta " + found.delta.map("{:g}".format)
+        labelled_rows = labelled(write_rows(path, rows))
+        if labelled_rows.groupby("method")["delta"].nunique().max() > 1:
+            labelled_rows["method"] += ", delta " + labelled_rows.delta.map("{:g}".format)
         title = f"{setting_title(task)}, NFE {options.evaluation.nfe[0]}"
-        draw(found, out / "curves.png", title, options.rl.warmup_steps)
+        draw(labelled_rows, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]
-        last = found.groupby([*agents, "seed"], sort=False).tail(1)
+        last = labelled_rows.groupby([*agents, "seed"], sort=False).tail(1)
         greedy = last[last.evaluation == "greedy"].assign(algorithm=last.algorithm.str.upper())
         plot_success(greedy, out / "success.png", f"{title}: greedy agents", group="algorithm")
         last = last.assign(seeds=last.groupby(agents)["seed"].transform("nunique"))
         text = table(last, agents, ["seeds", "delta", "environment_steps", "success_rate"])
-        write_report(out, text, text, found, failures)
+        write_report(out, text, text, labelled_rows, failures)
 
 
 def draw(rows: pd.DataFrame, path: Path, title: str, warmup_steps: int) -> None:
-    """Success of greedy and of stochastic agents against control steps (Fig. 7); at 0 the frozen policy.
+    """Draw success of greedy and of stochastic agents against control steps (Fig. 7), the frozen policy at 0.
 
-    Seeds are averaged evaluation by evaluation: they are due at the same number of control steps, and made
-    at the next decision.
+    Seeds are averaged evaluation by evaluation. Their numbers of control steps differ slightly, because an
+    evaluation waits for the end of a decision; the mean is drawn.
     """
     kinds = ("greedy", "stochastic")
     parts = [rows[rows.evaluation.isin(["base", kind])].assign(panel=f"{kind} agent") for kind in kinds]
@@ -218,9 +219,9 @@ def draw(rows: pd.DataFrame, path: Path, title: str, warmup_steps: int) -> None:
     number = shown.groupby([*agent, "seed"]).cumcount()
     same = shown.groupby([*agent, number])
     shown["environment_steps"] = same["environment_steps"].transform("mean")
-    # What all seeds have.
+    # Evaluations that some seeds lack are left out.
     shown = shown[same["seed"].transform("size") == shown.groupby(agent)["seed"].transform("nunique")]
-    lines = {"success_rate": f"success rate (from {warmup_steps:,} steps on it learns)"}
+    lines = {"success_rate": f"success rate (learning starts at {warmup_steps:,} steps)"}
     plot_lines(shown, path, title, "environment_steps", lines, "panel", "linear")
 
 

@@ -5,8 +5,8 @@ python benchmarks/pusht.py --dataset lerobot:FOLDER --demonstrations 25
 python benchmarks/pusht.py --task pusht:relative                   # actions are offsets from the agent
 python benchmarks/sigma.py --task pusht:task --dataset lerobot:FOLDER
 
-It needs two extras (pip install -e '.[sim,pusht]'). An episode's `coverage` is the best share of the goal
-that the block covers; it is solved above 0.95.
+It needs two extras (pip install -e '.[sim,pusht]'). The `coverage` of an episode is the largest share of the
+goal that the block covered; above 0.95 the episode is solved.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ OBSERVATION = ["observation.state", "observation.environment_state"]  # the agen
 
 
 def make_env(relative: bool = False) -> EnvBase:
-    """The environment, in raw units: pixels, in which actions are where the agent is to go."""
+    """Make the environment in raw units: actions are target positions of the agent, in pixels."""
     require("gym_pusht", "pusht")
     import gymnasium
 
-    name, seen = "gym_pusht/PushT-v0", "environment_state_agent_pos"
-    env: Any = gymnasium.make(name, obs_type=seen, render_mode="rgb_array")
+    name, observed = "gym_pusht/PushT-v0", "environment_state_agent_pos"
+    env: Any = gymnasium.make(name, obs_type=observed, render_mode="rgb_array")
     if relative:
         offsets, base = gymnasium.spaces.Box(-SIDE, SIDE, (2,)), env.unwrapped
         env = gymnasium.wrappers.TransformAction(env, lambda a: a + np.array(base.agent.position), offsets)
@@ -47,7 +47,7 @@ def make_env(relative: bool = False) -> EnvBase:
 
 
 def task(options: DataOptions, relative: bool = False) -> Task:
-    """The demonstrations, and where policies are played."""
+    """Return the task: human demonstrations, and the environment that policies are played in."""
     place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
     steps = lerobot_steps(place, OBSERVATION, demos=options.first("human"))
     if relative:
@@ -58,13 +58,13 @@ def task(options: DataOptions, relative: bool = False) -> Task:
 
 
 def relative(options: DataOptions) -> Task:
-    """The same with actions as offsets from where the agent is, as `--task pusht:relative`."""
+    """Return the task with actions as offsets from the agent's position: `--task pusht:relative`."""
     return task(options, relative=True)
 
 
-# All human demonstrations, unless --demonstrations says how many. On 25,650 steps of theirs the usual 10,000
-# iterations stop early: at one step the Gaussian source scores 0.59 after them, 0.79 after 22,500 and 0.88
-# after 45,000.
+# All human demonstrations are used unless --demonstrations says otherwise. Their 25,650 steps need more than
+# the usual 10,000 iterations: at one step the Gaussian source scores 0.59 after 10,000, 0.79 after 22,500 and
+# 0.88 after 45,000.
 HUMAN = {"data": {"task": ("pusht:task",), "demonstrations": (), "actions": "delta"}}
 LONGER = {"quick": {"iterations": 22_500}, "cpu": {"iterations": 45_000}}
 

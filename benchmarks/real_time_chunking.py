@@ -5,9 +5,9 @@ python benchmarks/real_time_chunking.py --toy alone         # minutes
 python benchmarks/real_time_chunking.py --task can stack --toy no --preset cpu
 python benchmarks/real_time_chunking.py --resume            # after an interruption
 
-While a chunk is computed, the one before is executed. Three sources are played as they are, and guided by
-Real-Time Chunking, with the same decisions per second at every delay. The policies
-of robomimic.py with the same options are used, not trained again.
+While a chunk is computed, the one before is executed. Each source is played without and with the guidance of
+Real-Time Chunking, with the same decisions per second at every delay. Policies that robomimic.py trained with
+the same options are reused.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ STUDY = "real-time-chunking"
 
 @dataclass(frozen=True)
 class DelayOptions(Options):
-    """A comparison under injected latency."""
+    """Options of a comparison under injected latency."""
 
-    delay: tuple[int, ...] = (0, 2, 4)  # control steps until chunks take effect, an evaluation each
-    execute: int | None = None  # actions per decision (default: as many as the largest delay leaves of H)
-    guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")  # without, by Real-Time Chunking
-    toy: Literal["beside", "alone", "no"] = "beside"  # the navigation toy: beside the tasks, or alone
-    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)  # of the guidance
+    delay: tuple[int, ...] = (0, 2, 4)  # delays to evaluate, in control steps until a chunk takes effect
+    execute: int | None = None  # actions executed per decision (default: H minus the largest delay)
+    guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")  # no guidance, Real-Time Chunking, or both
+    toy: Literal["beside", "alone", "no"] = "beside"  # play the toy in addition to the tasks, alone, or not
+    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)  # options of the guidance
 
     @property
     def name(self) -> str:
@@ -53,13 +53,13 @@ class DelayOptions(Options):
         check_given(self, "delay", "guidance")
         check_counts(self, "execute")
         if self.toy != "no" and self.evaluation.play_on:
-            raise ValueError("the toy has an end of its own: leave out --play-on, or add --toy no")
+            raise ValueError("--play-on does not work on the toy: leave it out, or add --toy no")
         for delay in self.delay:
             check_delay(delay, delay)
         for method in self.sources.methods():
             cells = self.conditions(method)
             if not cells:
-                raise ValueError(f"{method.name} is no flow to guide: add --guidance none, or leave it out")
+                raise ValueError(f"{method.name} has no flow to guide: leave it out, or add --guidance none")
             for cell in cells:
                 delay, execute, length = cell.delay or 0, cell.execute or 1, method.prediction_length
                 try:
@@ -75,7 +75,7 @@ class DelayOptions(Options):
                     ) from error
 
     def conditions(self, method: Method) -> list[Cell]:
-        """Every delay, without and with guidance, where there is a flow to guide."""
+        """Return the settings to play a method with: every delay, and every guidance that fits it."""
         execute = self.execute or max(1, self.sources.chunk[0] - max(self.delay))
         guidances = {"none": None, "rtc": self.rtc}
         return [
@@ -103,13 +103,14 @@ def main(argv: list[str] | None) -> None:
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["nfe", "delay"], ascending=[False, True], kind="stable")
         lines = {"success": "success rate", "boundary_jump": "jump where chunks take effect"}
-        for nfe, mine in seeds.groupby("nfe"):
+        for nfe, seeds_at_nfe in seeds.groupby("nfe"):
             end = f"_nfe{nfe}.png" if seeds.nfe.nunique() > 1 else ".png"
-            title = f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {len(options.seeds)} seed(s)"
-            mine = mine.assign(delay="delay " + mine.delay.astype(str))
-            plot_bars(mine, out / f"real_time_chunking{end}", title, "delay", lines)
-        given = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}
-        guidance = ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
+            actions = seeds_at_nfe.execute.iloc[0]
+            title = f"NFE {nfe}, {actions} actions per decision, {len(options.seeds)} seed(s)"
+            bars = seeds_at_nfe.assign(delay="delay " + seeds_at_nfe.delay.astype(str))
+            plot_bars(bars, out / f"real_time_chunking{end}", title, "delay", lines)
+        rtc_options = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}
+        guidance = ", ".join(f"{name} {value}" for name, value in rtc_options.items() if value is not None)
         notes = [f"{seeds.execute.iloc[0]} actions per decision at every delay. RTC: {guidance}."]
         names = ["success", "boundary_jump", "inner_jump"]
         text = table(seeds, ["setting", "nfe", "delay", "method"], names, notes)

@@ -1,4 +1,4 @@
-"""The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks.
+"""The paper's Table 1: Gaussian source, WP-Past and WP-Preview on robomimic's tasks.
 
 python benchmarks/robomimic.py                                   # a first table within minutes
 python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
@@ -26,18 +26,18 @@ from lab.report import success_report, summary, terminal_table, unlike, write_re
 def run(
     argv: list[str] | None, presets: Mapping[str, Options], study: str, doc: str | None, **parsing: Any
 ) -> None:
-    """The whole benchmark: options, data, training and playing, table and pictures."""
+    """Run the whole benchmark: options, data, training and playing, table and pictures."""
     options = parse(presets, argv, study, doc, **parsing)
     with started(options, study) as out:
-        # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
-        # seed: network, recipe and data are equal, and the source (lab/methods.py) differs. It meets the loss
-        # in lab/policies.py, in `train`.
+        # Demonstrations are generated, downloaded, or read from --dataset. There is a policy per task, method
+        # and seed. Policies of a task differ in the source alone (lab/methods.py); `train` in lab/policies.py
+        # gives it to the loss.
         policies = policies_of(options)
 
-        # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
+        # A row per policy, checkpoint and NFE: the policy, how it was played, and the result.
         rows, failures = compare(options, policies)
 
-        # The table, and what the flows look like.
+        # The table, then the pictures.
         top_k = options.evaluation.top_k
         results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
@@ -46,7 +46,7 @@ def run(
         try:
             write_report(out, terminal_table(results, top_k), full, results, failures)
         finally:
-            draw(options, policies, rows)  # pictures are the lesser loss
+            draw(options, policies, rows)  # drawn even if some policies are missing
 
 
 @script("robomimic.py", together=True)

@@ -4,7 +4,7 @@ python benchmarks/sigma.py                                # square ph, one seed,
 python benchmarks/sigma.py --data mh --preset cpu         # the paper's task, three seeds
 python benchmarks/sigma.py --resume                       # after an interruption
 
-The policies of robomimic.py with the same options are used, not trained again.
+Policies that robomimic.py trained with the same options are reused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 
 
 def preset(base: Options) -> MeasuredOptions:
-    """The paper's seven, at one network evaluation per chunk."""
+    """Return a preset with the paper's seven sigmas, at one network evaluation per chunk."""
     sources, evaluation = replace(base.sources, sigma=SIGMAS), replace(base.evaluation, nfe=(1,))
     return study(MeasuredOptions, base, sources=sources, evaluation=evaluation)
 
@@ -43,14 +43,14 @@ def main(argv: list[str] | None) -> None:
     check_single(options, "nfe")
     with started(options, "sigma") as out:
         policies = policies_of(options)
-        # Before the hours of training: what cannot be measured on is better known now.
+        # Before the training, so that data that cannot be measured on cost no hours.
         observations, source = held_out(options, policies[0])
         rows, failures = compare(options, policies)
         actors = trained_actors(policies, options.run.device)
         flow = straightness(actors, observations)
         curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{title_of(policies[0].task())}, NFE {options.evaluation.nfe[0]}"
-        # A line per source; one that takes no sigma has a single point.
+        # A line per source; a source without the option sigma is a single point.
         flow = pooled(curvatures[curvatures["mean"] == "training"])
         flow = flow.assign(relative_bound=flow.bound_executed / (flow.bound_executed.iloc[0] or math.nan))
         both = labelled(pd.concat([per_seed(rows, options.evaluation.top_k), flow]), "sigma", "chunk")
@@ -63,7 +63,10 @@ def main(argv: list[str] | None) -> None:
         text = table(seeds, ["method", "sigma"], ["success", "paper"])
         flow = labelled(pooled(curvatures), "sigma")
         names = ["ratio_executed", "ratio_relative", "bound_executed"]
-        notes = [f"Flow: on {source}, relative to the first policy. -: the policy predicts no motion."]
+        notes = [
+            f"Flow: measured on {source}, relative to the first policy. A dash marks a policy that predicts "
+            "no motion."
+        ]
         text += "\n" + table(flow, ["method", "sigma", "mean"], names, notes)
         write_report(out, text, text, pd.concat([rows, curvatures]), failures)
 

@@ -1,4 +1,4 @@
-"""Speed of the library as ratios to what it is built on, each measured in one run.
+"""Speed of the library as ratios to the code that it is built on, both measured in the same run.
 
 python benchmarks/throughput.py                                  # everything, a few minutes
 python benchmarks/throughput.py --only windows_over_torch actor_over_network
@@ -59,7 +59,7 @@ def paper_network() -> ChiTransformer:
 
 
 def small_network() -> VelocityMLP:
-    """That of the quick preset."""
+    """Return the network of the quick preset."""
     torch.manual_seed(0)
     return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
 
@@ -67,7 +67,7 @@ def small_network() -> VelocityMLP:
 def cloning(
     network: nn.Module, folder: str | Path, device: str = "cpu", *, graphs: bool = False, batch: int = BATCH
 ) -> BehaviourCloning:
-    """A training of the network, ready to step; if asked for as CUDA graphs."""
+    """Return a training of the network, ready to step, optionally with CUDA graphs."""
     actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=batch)
     options: dict[str, Any] = {"observation_steps": TO, "compile": graphs}
     training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, **options)
@@ -78,7 +78,7 @@ def cloning(
 def step_of(
     network: nn.Module, device: str = "cpu", *, graphs: bool = False, batch: int = BATCH
 ) -> Callable[[], None]:
-    """A training step of a network alone, on random numbers; if asked for as CUDA graphs."""
+    """Return a training step of a network alone on random numbers, optionally with CUDA graphs."""
     network.to(device)
     if graphs:
         network.compile(mode="reduce-overhead")
@@ -101,7 +101,7 @@ def step_of(
 
 
 def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor]]:
-    """Windows as one would write them in bare torch."""
+    """Return a function that samples windows in bare torch."""
     observation, action, episode = (data[key] for key in ("observation", "action", "episode"))
     length = int((episode == 0).sum())
     before, ahead = torch.arange(1 - TO, 1), torch.arange(-H, H)
@@ -121,21 +121,21 @@ def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor
 
 
 def windows_over_torch(clock: Clock) -> dict[str, float]:
-    """Windows per second of the replay buffer over those of bare torch, by batch."""
-    data, found = steps(400, 200), {}
+    """Measure windows per second of the replay buffer over bare torch, by batch size."""
+    data, ratio_by_batch = steps(400, 200), {}
     for batch in (BATCH, 1024):
         buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        found[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
-    return found
+        ratio_by_batch[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
+    return ratio_by_batch
 
 
 def lerobot_windows_over_getitem(clock: Clock) -> float | None:
-    """Windows of a LeRobotDataset, over those that its own ``__getitem__`` gives."""
+    """Measure windows per second from a LeRobotDataset over its own ``__getitem__``."""
     os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
     if not all(find_spec(name) for name in ("lerobot", "datasets", "pyarrow")):
-        tqdm.write("lerobot_windows_over_getitem: skipped, needs warmprior[lerobot]")
+        tqdm.write("lerobot_windows_over_getitem: skipped, because it needs warmprior[lerobot]")
         return None
-    logging.disable(logging.WARNING)  # about video decoders, which are not used here
+    logging.disable(logging.WARNING)  # LeRobot warns of video decoders, which are not used here
     from lerobot.datasets import LeRobotDataset
 
     data, fps = steps(25, 200), 20
@@ -155,11 +155,11 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
             "action": [i / fps for i in range(-H, H)],
             "observation.state": [i / fps for i in range(1 - TO, 1)],
         }
-        theirs = LeRobotDataset(name, root=root, delta_timestamps=offsets)
-        read = LeRobotDemonstrations(root).data
-        buffer = window_replay_buffer(read, PRIOR, batch_size=BATCH, observation_steps=TO)
+        dataset = LeRobotDataset(name, root=root, delta_timestamps=offsets)
+        demonstrations = LeRobotDemonstrations(root).data
+        buffer = window_replay_buffer(demonstrations, PRIOR, batch_size=BATCH, observation_steps=TO)
         ratio = clock.ratio(
-            lambda: [theirs[i] for i in torch.randint(len(data), (64,)).tolist()],
+            lambda: [dataset[i] for i in torch.randint(len(data), (64,)).tolist()],
             lambda: [buffer.sample() for _ in range(20)],
         )
     return ratio * 20 * BATCH / 64
@@ -169,10 +169,10 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
 
 
 def lacks(device: str) -> bool:
-    """Say that a figure is left out, where it needs a GPU and there is none."""
+    """Return True, and print a line, if a figure needs a GPU and there is none."""
     if device == "cpu" or torch.cuda.is_available():
         return False
-    tqdm.write(f"a figure on {device}: skipped, needs a GPU")
+    tqdm.write(f"a figure on {device}: skipped, because it needs a GPU")
     return True
 
 
@@ -192,20 +192,21 @@ def steps_per_second(
     batch: int = PAPER.batch_size,
     calls: int = 20,
 ) -> dict[str, float] | None:
-    """Training steps of the library and of bare torch, as they are and on a GPU also as CUDA graphs."""
+    """Measure training steps per second of the library and of bare torch; on a GPU also with CUDA graphs."""
     if lacks(device):
         return None
     with tempfile.TemporaryDirectory() as folder:
-        ways: dict[str, Callable[[], object]] = {}
+        step_by_name: dict[str, Callable[[], object]] = {}
         for graphs in (False, True) if device != "cpu" else (False,):
             name = " as graphs" if graphs else ""
             options: dict[str, Any] = {"graphs": graphs, "batch": batch}
-            ways[f"warmprior{name}"] = cloning(network(), f"{folder}/{graphs}", device, **options).step
-            ways[f"torch{name}"] = step_of(network(), device, **options)
-        # Several steps are waited for together: a step that waits for nothing gains from it.
-        times = clock.times(*(partial(_round, step, calls) for step in ways.values()))
-    found = zip(ways, times, strict=True)
-    return {name: calls / statistics.median(seconds) for name, seconds in found}
+            training = cloning(network(), f"{folder}/{graphs}", device, **options)
+            step_by_name[f"warmprior{name}"] = training.step
+            step_by_name[f"torch{name}"] = step_of(network(), device, **options)
+        # Synchronised after several steps, so that asynchronous launches overlap as in a training.
+        times = clock.times(*(partial(_round, step, calls) for step in step_by_name.values()))
+    rounds = zip(step_by_name, times, strict=True)
+    return {name: calls / statistics.median(seconds) for name, seconds in rounds}
 
 
 def preconditioning_over_network(clock: Clock) -> float:
@@ -214,11 +215,11 @@ def preconditioning_over_network(clock: Clock) -> float:
 
 
 SCALED = {"paper": (paper_network, 1), "small": (small_network, 10)}
-"""Networks, and training steps per round."""
+"""By name: a network, and the number of training steps per round."""
 
 
 def _round(step: Callable[[], object], calls: int) -> torch.Tensor:
-    """Seconds, and seconds of processor time."""
+    """Run some steps, and return their time and processor time in seconds."""
     start = time.perf_counter(), time.process_time()
     for _ in range(calls):
         step()
@@ -226,14 +227,14 @@ def _round(step: Callable[[], object], calls: int) -> torch.Tensor:
 
 
 def _scale(number: int, port: int, repeats: int, folder: str) -> None:
-    """In turn: the first process trains alone while the other waits, and both train together."""
+    """Time both in turn: the first process trains alone while the other waits, then both train together."""
     torch.set_num_threads(1)
     os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": "2"}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     alone = {name: cloning(make(), Path(folder) / name) for name, (make, _) in SCALED.items()}
     with joined():
         for name, (make, calls) in SCALED.items():
-            both, found = cloning(make(), Path(folder) / f"{name} {number}"), []
+            both, ratios = cloning(make(), Path(folder) / f"{name} {number}"), []
             for repeat in range(repeats + 1):
                 torch.distributed.barrier()
                 one = _round(alone[name].step, calls) if not rank() else torch.zeros(2)
@@ -241,23 +242,23 @@ def _scale(number: int, port: int, repeats: int, folder: str) -> None:
                 two = _round(both.step, calls)
                 torch.distributed.all_reduce(two)
                 if repeat:  # the first round warms up
-                    found.append(one / two)
+                    ratios.append(one / two)
             if not rank():
-                torch.save(torch.stack(found).median(0).values, Path(folder) / f"{name}.pt")
+                torch.save(torch.stack(ratios).median(0).values, Path(folder) / f"{name}.pt")
 
 
 def ddp_efficiency(clock: Clock) -> dict[str, dict[str, float]]:
-    """Windows per second of two processes of a thread, over twice those of one, at the same whole batch.
+    """Measure windows per second of two processes over twice those of one, for the same total batch.
 
-    By time, and by processor time, which tells what sharing a batch costs where other work takes the cores.
+    The processor time tells the cost of sharing a batch even if other programs use the cores.
     """
     with socket.socket() as free, tempfile.TemporaryDirectory() as folder:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
         torch.multiprocessing.spawn(_scale, (port, clock.repeats, folder), nprocs=2)
-        found = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
-    return {name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()}
+        medians = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
+    return {name: dict(zip(("time", "processor"), pair, strict=True)) for name, pair in medians.items()}
 
 
 # Decisions
@@ -274,14 +275,14 @@ def actor_over_network(clock: Clock) -> dict[str, float]:
     network = paper_network().eval()
     actor = WarmPriorActor(network, PRIOR).eval()
     data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
-    found = {}
+    ratio_by_nfe = {}
     for nfe in NFES:
-        found[str(nfe)] = clock.ratio(
+        ratio_by_nfe[str(nfe)] = clock.ratio(
             partial(actor, data, nfe=nfe),
             partial(_passes, network, (t, a, data["observation"]), nfe),
             calls=max(2, 18 // nfe),
         )
-    return found
+    return ratio_by_nfe
 
 
 # Control steps
@@ -292,7 +293,7 @@ def env_over_robosuite(clock: Clock) -> float:
     lean, own = (env.loop for env in envs)
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, D_A))
 
-    def before() -> None:  # the same episode on both sides: contacts decide what a step costs
+    def before() -> None:  # both play the same episode, because contacts decide what a step costs
         lean.reset(0)
         own.reset(0)
 
@@ -304,7 +305,7 @@ def env_over_robosuite(clock: Clock) -> float:
 
 
 class Particles(EnvBase):
-    """A batched simulator: ``n`` chains of masses, ten integration steps per control step."""
+    """A batched simulator of ``n`` chains of masses, with ten integration steps per control step."""
 
     def __init__(self, n: int, masses: int = 32) -> None:
         super().__init__(batch_size=[n])
@@ -318,12 +319,12 @@ class Particles(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         torch.manual_seed(seed or 0)
 
-    def _seen(self) -> torch.Tensor:
+    def _observation(self) -> torch.Tensor:
         return self.state[0, :, :D_O].clone()
 
     def _reset(self, tensordict: TensorDict | None = None, **kwargs: Any) -> TensorDict:
         self.state.zero_()
-        return TensorDict({"observation": self._seen()}, self.batch_size).update(self.done_spec.zero())
+        return TensorDict({"observation": self._observation()}, self.batch_size).update(self.done_spec.zero())
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
         position, velocity = self.state
@@ -332,8 +333,9 @@ class Particles(EnvBase):
             force[:, :D_A] += tensordict["action"]
             velocity += 0.01 * force
             position += 0.01 * velocity
-        found = {"observation": self._seen(), "reward": position.square().sum(-1, keepdim=True)}
-        return TensorDict(found, self.batch_size).update(self.done_spec.zero())
+        reward = position.square().sum(-1, keepdim=True)
+        result = {"observation": self._observation(), "reward": reward}
+        return TensorDict(result, self.batch_size).update(self.done_spec.zero())
 
 
 def batched_chunk_step(clock: Clock) -> float:
@@ -354,7 +356,7 @@ def batched_chunk_step(clock: Clock) -> float:
 
 
 def chunk_step_overhead(clock: Clock) -> float:
-    # Statistics that leave actions as they are, so that both sides simulate the same.
+    # These statistics leave actions as they are, so that both sides simulate the same.
     high = {"observation": torch.ones(D_O), "action": torch.ones(D_A)}
     normalizer = Normalizer({key: -value for key, value in high.items()}, high)
     alone, wrapped = RobosuiteEnv("square"), RobosuiteEnv("square")  # of 400 steps; 40 are taken
@@ -396,9 +398,10 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"of {', '.join(FIGURES)}")
-    add("--out", type=Path, default=Path("runs/throughput"), help="folder of throughput.json")
-    add("--repeats", type=int, default=11, help="rounds per figure (default: 11)")
+    names, out = ", ".join(FIGURES), Path("runs/throughput")
+    add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"figures to measure, of {names}")
+    add("--out", type=Path, default=out, help="folder of throughput.json (default: %(default)s)")
+    add("--repeats", type=int, default=11, help="rounds per figure (default: %(default)s)")
     options = parser.parse_args(argv)
     if options.repeats < 1:
         parser.error("--repeats must be at least 1")

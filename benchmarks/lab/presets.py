@@ -52,20 +52,20 @@ IMAGES: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def adapted[O: Options](preset: O, asked: Options) -> O:
+def adapted[O: Options](preset: O, typed: Options) -> O:
     """A preset for what policies are to see.
 
     Where ImageNet's weights cannot be had, an encoder that would start from them starts from random ones.
     """
-    if "image" not in (asked.data.obs, preset.data.obs):
+    if "image" not in (typed.data.obs, preset.data.obs):
         return preset
     if preset.data.obs == "state":
-        changed = {part: dict(values) for part, values in IMAGES[asked.run.preset].items()}
+        changed = {part: dict(values) for part, values in IMAGES[typed.run.preset].items()}
         changed["data"] = {**changed.get("data", {}), "obs": "image"}
-        if asked.run.preset == "quick" and not preset.data.task:
+        if typed.run.preset == "quick" and not preset.data.task:
             changed["data"] |= {"task": ("lift",), "demonstrations": (100,)}
         preset = with_parts(preset, **changed)
-    if preset.network.encoder == asked.network.encoder == PRETRAINED:
+    if preset.network.encoder == typed.network.encoder == PRETRAINED:
         try:
             imagenet_weights()
         except (OSError, ImportError) as error:
