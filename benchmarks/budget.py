@@ -1,4 +1,4 @@
-"""How much training the sources need: success and held-out error against iterations.
+"""The training that sources need: success and held-out error against iterations.
 
 python benchmarks/budget.py                                          # square ph, four budgets, one seed
 python benchmarks/budget.py --task can --budgets 2500 10000 --nfe 1

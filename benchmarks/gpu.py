@@ -61,8 +61,8 @@ SMALLEST: dict[str, dict[str, Any]] = {
 class GpuOptions:
     """Options of this script: the parts to run, their policies, and their time."""
 
-    # parts to run: 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5 from images
-    # (default: all)
+    # parts to run (default: all): 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5
+    # trainings from images
     part: tuple[int, ...] = ()
     minutes: float | None = None  # time limit of a part in minutes (default: 3 to 7.5)
     preset: str = "paper"  # preset of robomimic.py for network and recipe of parts 4 and 5

@@ -50,7 +50,7 @@ class NavigationOptions(Options):
         check_single(self, "chunk")
         if self.data != DataOptions():
             raise ValueError(
-                "the toy has its own demonstrations: leave out --task, --data and other options of data"
+                "the toy has demonstrations of its own: leave out --task, --data and other options of data"
             )
         if self.sources.chunk[0] > STEPS:
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")

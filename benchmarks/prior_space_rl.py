@@ -127,7 +127,7 @@ def adapt(preset: AgentsOptions, typed: AgentsOptions) -> AgentsOptions:
     elif name == "quick" and typed.data.dataset is None:
         tasks = tasks or ("lift",)
     if name == "paper" and not tasks:
-        raise ValueError("--preset paper has hyper-parameters per task: add --task")
+        raise ValueError("--preset paper has hyper-parameters per task: add the --task")
     changed = with_parts(preset, **BY_TASK.get((name, next(iter(tasks), "")), {}))
     return with_parts(changed, data={"task": tasks})
 

@@ -28,7 +28,7 @@ from warmprior.envs import gym_env
 from warmprior.io.extras import require
 from warmprior.training import Task
 
-SIDE = 512.0  # of the field, in pixels
+SIDE = 512.0  # side of the field in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners
 
 

@@ -59,7 +59,7 @@ class DelayOptions(Options):
         for method in self.sources.methods():
             cells = self.conditions(method)
             if not cells:
-                raise ValueError(f"{method.name} has no flow to guide: leave it out, or add --guidance none")
+                raise ValueError(f"{method.name} is no flow to guide: leave it out, or add --guidance none")
             for cell in cells:
                 delay, execute, length = cell.delay or 0, cell.execute or 1, method.prediction_length
                 try:

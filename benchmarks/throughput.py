@@ -290,15 +290,15 @@ def actor_over_network(clock: Clock) -> dict[str, float]:
 
 def env_over_robosuite(clock: Clock) -> float:
     envs = RobosuiteEnv("square"), RobosuiteEnv("square", control_loop="robosuite")
-    lean, own = (env.loop for env in envs)
+    lean, robosuite = (env.loop for env in envs)
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, D_A))
 
     def before() -> None:  # both play the same episode, because contacts decide what a step costs
         lean.reset(0)
-        own.reset(0)
+        robosuite.reset(0)
 
     return clock.ratio(
-        lambda: [own.env.step(action) for action in actions],
+        lambda: [robosuite.env.step(action) for action in actions],
         lambda: [lean.step(action) for action in actions],
         before=before,
     )
@@ -359,7 +359,7 @@ def chunk_step_overhead(clock: Clock) -> float:
     # These statistics leave actions as they are, so that both sides simulate the same.
     high = {"observation": torch.ones(D_O), "action": torch.ones(D_A)}
     normalizer = Normalizer({key: -value for key, value in high.items()}, high)
-    alone, wrapped = RobosuiteEnv("square"), RobosuiteEnv("square")  # of 400 steps; 40 are taken
+    alone, wrapped = RobosuiteEnv("square"), RobosuiteEnv("square")  # 40 of 400 steps are taken
     env = TransformedEnv(wrapped, policy_transforms(PRIOR, normalizer=normalizer))
     chunks = torch.rand(5, H, D_A, generator=torch.Generator().manual_seed(0)) * 0.6 - 0.3
     data = None
@@ -399,7 +399,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     names, out = ", ".join(FIGURES), Path("runs/throughput")
-    add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"figures to measure, of {names}")
+    add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"figures of {names} (default: all)")
     add("--out", type=Path, default=out, help="folder of throughput.json (default: %(default)s)")
     add("--repeats", type=int, default=11, help="rounds per figure (default: %(default)s)")
     options = parser.parse_args(argv)

@@ -1,4 +1,4 @@
-"""Agents in source space: their options, the frozen policies that they act through, and environments."""
+"""Agents in source space: their options, frozen policies and environments."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from warmprior.transforms import EncodeObservation
 
 TOY = "navigation"
 
-# The recipe of an agent, without what the options that all experiments share say. On a command line they have
-# a prefix: gradient steps, say, are those of behaviour cloning in all experiments.
+# The recipe of an agent, without the options that all benchmarks share. On the command line its options have
+# the prefix rl, because --learning-rate and the like are those of behaviour cloning.
 HINTS = get_type_hints(PriorSpaceConfig)
 SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes", "delta")
 AgentOptions: Any = make_dataclass(
@@ -47,12 +47,12 @@ Algorithm = Literal["dsrl-na", "dsrl-sac"]
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm is an algorithm with a box, around the frozen policies of a method."""
+    """An arm is an algorithm and a box, applied to the frozen policies of a method."""
 
     method: Method
     algorithm: str
-    centre: str  # of its box: the mean of the source, or zero
-    delta: float | None  # half its box
+    centre: str  # centre of the box: the source's mean, or zero
+    delta: float | None  # half the width of the box
 
     def __post_init__(self) -> None:
         if self.centre == "zero" and self.method.has_anchor:
@@ -61,15 +61,15 @@ class Arm:
                 raise ValueError(f"--centre zero: {self.method.name} has a centre of its own, leave it out")
 
     def __str__(self) -> str:
-        given = self.method.arguments.get("sigma")
-        sigma = "" if given is None else f"sigma={given:g}"
+        value = self.method.arguments.get("sigma")
+        sigma = "" if value is None else f"sigma={value:g}"
         source = ",".join(filter(None, (self.method.name, sigma, self.method.options)))
         around = " around zero" if self.centre == "zero" and self.method.has_anchor else ""
         box = "" if self.delta is None else f", delta {self.delta:g}"
         return f"{self.algorithm} {source}{around}{box}"
 
     def policy(self, actor: WarmPriorActor) -> WarmPriorActor:
-        """The policy as the agent sees it: around zero its source is cold, and its field as it was."""
+        """Return the policy for the agent; around zero it has a cold source and the same field."""
         if self.centre == "mean" or not self.method.has_anchor:
             return actor
         return actor.replace(prior=ColdPrior(actor.prior.chunk_length, actor.prior.prediction_chunks))
@@ -77,19 +77,18 @@ class Arm:
 
 @dataclass(frozen=True)
 class AgentsOptions(Options):
-    """A comparison of agents; the frozen policies are those of a comparison of sources."""
+    """Options of a comparison of agents that act through the policies of a comparison of sources."""
 
-    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
+    policies: FinishedRun = None  # folder of a finished run whose policies to use (default: train them)
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
-    algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
-    warm_algorithm: tuple[Algorithm, ...] = ()  # of sources with a mean (default: as --algorithm)
-    # Of policies whose source has a mean: where their agents search, around it or, as a control, around zero.
+    algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # algorithms of the agents
+    warm_algorithm: tuple[Algorithm, ...] = ()  # algorithms for warm sources (default: as --algorithm)
+    # for warm sources, centre of the search: the source's mean, zero as a control, or both
     centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
-    delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
-    horizon: int | None = None  # time limit in control steps (default: the task's)
-    num_envs: int = 4  # parallel environments of an agent
-    # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
-    # itself collects).
+    delta: tuple[float, ...] = ()  # half widths of the agents' boxes (default: 0.5 around a mean, else 1.5)
+    horizon: int | None = None  # control steps per episode (default: the task's)
+    num_envs: int = 4  # number of parallel environments per agent
+    # number of Ray actors that collect, with --num-envs environments each; needs --engine ray (default: none)
     collectors: int | None = None
 
     @property
@@ -102,7 +101,7 @@ class AgentsOptions(Options):
 
     def check(self) -> None:
         check_counts(self, "horizon", "num_envs", "collectors")
-        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
+        if self.collectors is not None and self.collectors > 10:  # more would share seeds with other runs
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
@@ -115,12 +114,14 @@ class AgentsOptions(Options):
             check_network(self.network, self.data)
         for method in self.sources.methods():
             if not method.is_flow:
-                raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
+                raise ValueError(
+                    f"--prior {method.name} is no flow and has no source space to act in: leave it out"
+                )
             for arm in self.arms(method):
                 self.agent(arm, 0)
 
     def arms(self, method: Method) -> list[Arm]:
-        """The agents that learn around a method's policies."""
+        """Return the arms of a method."""
         centres = self.centre if method.has_anchor else ("zero",)
         algorithms = self.warm_algorithm if method.has_anchor else ()
         parts = product(algorithms or self.algorithm, centres, self.delta or (None,))
@@ -128,7 +129,7 @@ class AgentsOptions(Options):
 
     def agent(self, arm: Arm, seed: int) -> PriorSpaceConfig:
         shared: Mapping[str, Any] = asdict(self.rl)
-        own: dict[str, Any] = {
+        options_of_arm: dict[str, Any] = {
             "algorithm": arm.algorithm,
             "seed": seed,
             "nfe": self.evaluation.nfe[0],
@@ -136,11 +137,11 @@ class AgentsOptions(Options):
             "backup_entropy": shared["backup_entropy"] or arm.algorithm == "dsrl-sac",
             "delta": arm.delta,
         }
-        return PriorSpaceConfig(**{**shared, **own})
+        return PriorSpaceConfig(**{**shared, **options_of_arm})
 
 
 def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
-    """The task, and the frozen policies by method and seed: of --run, or trained now."""
+    """Return the task, and the frozen policies by method and seed, from --run or trained first."""
     run = options.policies
     policies = policies_of(options) if run is None else finished_policies(run, options)
     if not options.is_toy:
@@ -159,19 +160,19 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
 def environment(
     actor: WarmPriorActor, is_toy: bool, num_envs: int, options: Mapping[str, Any], seed: int
 ) -> EnvBase:
-    """The environment of agents around a frozen policy; the simulator's is in workers."""
-    if is_toy:  # nothing but the anchor is random
+    """Make the environment of agents around a frozen policy; simulators run in worker processes."""
+    if is_toy:  # only the anchor is random
         transforms = policy_transforms(actor.prior, observation_steps=1, see_history=actor.sees_history)
         transforms.append(PriorAnchor(actor))
         return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
     make_env, make_transforms = environment_parts(actor)
     workers = parallel_env(partial(make_env, **options), make_transforms, num_envs)
-    # Outside of the workers one anchor draws for all, and one encoder serves all.
+    # Outside of the workers, one anchor draws for all environments, and one encoder serves all.
     env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
     env.set_seed(seed, static_seed=True)
     return env
 
 
 def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
-    """Return the transforms that turn images into features, for agents of a policy that sees images."""
+    """Return the transforms that turn images into features, for policies that see images."""
     return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []

@@ -1,4 +1,4 @@
-"""SB-CFM: pairs of a Schroedinger bridge, and the noisy path between them."""
+"""SB-CFM: pairs from a Schroedinger bridge, and the noisy path between them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class BridgeInterpolant(Interpolant):
         a_t = (1 - t) a_0 + t a_1 + \sigma \sqrt{t (1 - t)} \, \varepsilon, \qquad
         u_t = a_1 - a_0 + \sigma \frac{1 - 2t}{2 \sqrt{t (1 - t)}} \, \varepsilon .
 
-    On pairs of :class:`BridgeCoupling` the mean of :math:`u_t` given :math:`a_t` is the
+    On pairs from :class:`BridgeCoupling` the mean of :math:`u_t` given :math:`a_t` is the
     probability flow of the Schroedinger bridge. The velocity grows without bound towards the ends: times are
     kept 0.001 away from them.
 
     Args:
-        sigma: of the noise, > 0, in normalised action units.
+        sigma: standard deviation of the noise, > 0, in normalised action units.
 
     Raises:
         ValueError: if ``sigma`` is not a finite number > 0.
@@ -52,7 +52,7 @@ class BridgeInterpolant(Interpolant):
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Point on the path and its velocity, with noise of ``generator``."""
+        """Return the point on the path and its velocity, with noise from ``generator``."""
         point, velocity = super().__call__(a0, a1, t)
         t = t[..., None, None].clamp(1e-3, 1 - 1e-3)
         width = (t * (1 - t)).sqrt()
@@ -64,18 +64,18 @@ class BridgeInterpolant(Interpolant):
 class BridgeCoupling(OTCoupling):
     r"""SB-CFM: source and data are paired as in the Schroedinger bridge of Brownian motion.
 
-    Every target draws its source from the entropic plan of the batch,
+    Every target draws its source sample from the entropic plan of the batch,
 
     .. math::
         \pi_{ij} \propto u_i v_j \exp\left(- c_{ij} / 2 \sigma^2\right), \qquad
         c_{ij} = \|a_0^i - a_1^j\|^2 + w \|o^i - o^j\|^2,
 
     with uniform marginals (Tong et al., 2024, Prop. 3.4), and the path between them is a Brownian bridge,
-    :class:`BridgeInterpolant`, which the loss takes from here. At small ``sigma`` this is
-    :class:`~warmprior.OTCoupling`, at a large one pairs are as they come.
+    :class:`BridgeInterpolant`, which the loss takes from here. For small ``sigma`` this is
+    :class:`~warmprior.OTCoupling`; for large ``sigma`` pairs are independent.
 
     Args:
-        sigma: of the Brownian motion at ``t = 1``, > 0, in normalised action units.
+        sigma: standard deviation of the Brownian motion at ``t = 1``, > 0, in normalised action units.
         observation_weight: ``w``, see :class:`~warmprior.OTCoupling`.
 
     Raises:
@@ -89,7 +89,7 @@ class BridgeCoupling(OTCoupling):
         [[1.0, 0.0], [5.0, 4.0]]
     """
 
-    ROUNDS: ClassVar[int] = 5  # of Sinkhorn's iteration at each noise, five times as many at the last
+    ROUNDS: ClassVar[int] = 5  # Sinkhorn iterations at each noise level, five times as many at the last
 
     def __init__(self, sigma: float = 0.5, observation_weight: float = 10.0) -> None:
         super().__init__(observation_weight)
@@ -100,8 +100,8 @@ class BridgeCoupling(OTCoupling):
         return {**super().config(), "name": "bridge", "sigma": self.interpolant.sigma}
 
     def assigned(self, cost: Tensor) -> Tensor:
-        """Drawn from the plan by PyTorch's global generator, which a training seeds."""
-        # From a large noise down by halves: at a small one alone the iteration hardly moves.
+        """Draw pairs from the plan by PyTorch's global generator, which a training seeds."""
+        # The noise is halved step by step, because the iteration hardly moves at a small noise alone.
         noise = 2 * self.interpolant.sigma**2
         halvings = math.ceil(math.log2(max(1.0, float(cost.max()) / noise)))
         row = cost.new_zeros(len(cost), 1)

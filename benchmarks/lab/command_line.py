@@ -1,4 +1,4 @@
-"""A script and its command line: options that are read and checked, and the folder that it writes to."""
+"""The command line of a script: its options, read and checked, and its output folder."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ def parse[O: Options](
     description: str | None,
     adapt: Callable[[O, O], O] = adapted,
 ) -> O:
-    """The options of a command line, checked, with their output folder.
+    """Return the options of a command line, checked, with their output folder.
 
-    They start from those of --preset, or with --resume from those stored in the folder, which the command
-    line may then only repeat.
+    They start from the options of --preset. With --resume they are those stored in the folder, and the
+    command line may only repeat them.
     """
     argv = sys.argv[1:] if argv is None else list(map(str, argv))
-    asked = read(next(iter(presets.values())), argv, description)
-    if asked.run.preset not in presets:
-        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {asked.run.preset!r}")
-    base = presets[asked.run.preset]
-    known = (*argv, *base.sources.prior, *base.data.task)  # no name of a file's
-    base = adapt(base, asked)
-    if not asked.data.generated:  # the demonstrations of presets are numbers to generate
+    typed = read(next(iter(presets.values())), argv, description)
+    if typed.run.preset not in presets:
+        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {typed.run.preset!r}")
+    base = presets[typed.run.preset]
+    importable = (*argv, *base.sources.prior, *base.data.task)
+    base = adapt(base, typed)
+    if not typed.data.generated:  # a preset's number is for generated demonstrations
         base = with_parts(base, data={"demonstrations": ()})
-    finished: Path | None = getattr(asked, "policies", None)
+    finished: Path | None = getattr(typed, "policies", None)
     if finished is not None:
-        theirs = stored_options(Options, finished, None)
+        finished_options = stored_options(Options, finished, None)
         base = with_parts(
             base,
-            **{part: getattr(theirs, part) for part in ("data", "network", "training", "sources")},
-            evaluation={"seeds": theirs.evaluation.seeds},
-            run={"compile": theirs.run.compile},
+            **{part: getattr(finished_options, part) for part in ("data", "network", "training", "sources")},
+            evaluation={"seeds": finished_options.evaluation.seeds},
+            run={"compile": finished_options.run.compile},
         )
     options = read(base, argv, description)
     out = from_leader(lambda: output_folder(options, study))
@@ -65,7 +65,7 @@ def parse[O: Options](
         options = read(stored, argv, description)
         check_same(stored, options, f"{out} was started with other values of", "choose another --out")
     if options.run.resume or finished is not None:
-        check_typed(options, finished or out, known)
+        check_typed(options, finished or out, importable)
     if finished is not None:
         of_run(options, finished)
     check_device(options.run.device)
@@ -78,31 +78,31 @@ def parse[O: Options](
         check_ray(options.run.ray_address)
     options.check()
     place = options.data.dataset
-    if place is not None:  # workers on other machines have other working directories
+    if place is not None:  # workers may have another working directory
         options = with_parts(options, data={"dataset": Path(resolved_place(place))})
     return with_parts(options, run={"out": out})
 
 
 def read[O](default: O, argv: Sequence[str], description: str | None) -> O:
-    """A command line, on top of defaults."""
-    written = io.StringIO()
-    # A line that begins with a sign stays a line of its own.
+    """Read a command line on top of defaults."""
+    stderr = io.StringIO()
+    # tyro joins lines, unless they begin with a symbol.
     description = re.sub(r"^(?=python |torchrun )", "$ ", description or "", flags=re.M)
     try:
-        with redirect_stderr(written):
+        with redirect_stderr(stderr):
             kind: Any = type(default)
             return tyro.cli(kind, default=default, args=argv, description=description)
     except SystemExit as stop:
-        # What a dataclass refuses is reported like all that we refuse; what no option is, by tyro.
-        refused: Any = stop.__context__
-        if isinstance(getattr(refused, "arg", None), str):
-            raise ValueError(str(refused.message)) from None
-        sys.stderr.write(written.getvalue())
+        # Errors of our dataclasses are reported in one line like all others; tyro reports unknown options.
+        cause: Any = stop.__context__
+        if isinstance(getattr(cause, "arg", None), str):
+            raise ValueError(str(cause.message)) from None
+        sys.stderr.write(stderr.getvalue())
         raise
 
 
 def output_folder(options: Options, study: str) -> Path:
-    """The folder to write to; never one that holds a run, unless it is to be continued."""
+    """Return the output folder; raise ValueError if it holds a run that is not to be continued."""
     out, resume = options.run.out, options.run.resume
     if out is None:
         prefix = [] if study == "robomimic" else [study]
@@ -122,7 +122,7 @@ def output_folder(options: Options, study: str) -> Path:
 def script(
     name: str, together: bool = False, hint: str = "--resume continues"
 ) -> Callable[[Callable[..., object]], Callable[..., int]]:
-    """Make a function of a command line the `main` of a script, with errors as lines and an exit code."""
+    """Decorate a script's `main`: errors become one line, and it returns an exit code."""
     return lambda work: (
         lambda argv=None: run_script(lambda: work(argv), name, errors=ERRORS, together=together, hint=hint)
     )
@@ -130,9 +130,9 @@ def script(
 
 @contextmanager
 def started(options: Options, study: str) -> Iterator[Path]:
-    """The output folder, with the options in it, and without another process."""
+    """Yield the output folder, with the options in it, locked against other processes."""
     out = options.run.folder
-    if rank():  # the first process is in it, for all
+    if rank():  # the first process has the lock
         yield out
         return
     check_writable(out)
@@ -145,6 +145,6 @@ def started(options: Options, study: str) -> Iterator[Path]:
         try:
             yield out
         except Exception:
-            if not options.run.resume and len(list(out.iterdir())) == 1:  # nothing was begun
+            if not options.run.resume and len(list(out.iterdir())) == 1:  # only options.json
                 (out / "options.json").unlink()
             raise

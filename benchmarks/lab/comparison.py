@@ -1,4 +1,4 @@
-"""Train, measure and play what a comparison of sources asks for, as jobs."""
+"""The jobs of a comparison of sources: train, measure and play its policies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic
 from warmprior.training import Episode
 
-EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
+EPISODES_PER_JOB = 5  # few keep all cores busy to the end, many load policies less often
 
 
 def compare(
@@ -32,14 +32,18 @@ def compare(
     policies: Sequence[Policy],
     conditions: Callable[[Method], Sequence[Cell]] = lambda method: [Cell(0, 0)],
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Train, measure and play what is missing; the rows so far, and what failed.
+    """Train, measure and play what is missing; return the rows of the run, and its failures.
 
-    Rows do not depend on who computes them, nor in which order. `conditions` lists how else policies are
-    played: a row for each.
+    Rows depend neither on the process that computes them nor on their order. `conditions` returns, for a
+    method, delays and guidances to play it with; each gives a row.
+
+    Raises:
+        ValueError: if the folder has rows of another run.
+        PartialFailure: if no row could be computed.
     """
     evaluation, places = options.evaluation, {p.name: i for i, p in enumerate(policies)}
     for policy in {policy.place: policy for policy in policies}.values():
-        # What cannot be played is better known before the hours of training.
+        # Before the training, so that a task that cannot be played costs no hours.
         from_leader(partial(policy.task().check_environment, **evaluation.environment))
 
     def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -71,9 +75,10 @@ def compare(
         for policy in policies
     }
     played = {p.name: {c: (p.facts | c.facts()).items() for c in cells[p.name]} for p in policies}
-    for number, found in enumerate(rows, 1):
-        mine = played[found["policy"]].values()
-        if found["episodes"] != evaluation.episodes or not any(facts <= found.items() for facts in mine):
+    for number, stored in enumerate(rows, 1):
+        facts_of_cells = played[stored["policy"]].values()
+        matches = any(facts <= stored.items() for facts in facts_of_cells)
+        if stored["episodes"] != evaluation.episodes or not matches:
             raise ValueError(
                 f"{path}, line {number} is no row of this run: remove that line, and continue with --resume"
             )
@@ -92,7 +97,7 @@ def compare(
 
 
 def train_all(options: Options, policies: Sequence[Policy]) -> None:
-    """Train what is missing, and play nothing."""
+    """Train the policies that are not trained yet; raise PartialFailure if one fails."""
     failures = begin(options, policies)
     with Jobs(options.run) as jobs:
         for policy in policies:
@@ -102,9 +107,9 @@ def train_all(options: Options, policies: Sequence[Policy]) -> None:
 
 
 def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
-    """Write `tasks.json`, and under torchrun train each policy in all processes together; what failed.
+    """Write `tasks.json`, and under torchrun train every policy in all processes; return failures by policy.
 
-    The first process goes on alone.
+    Afterwards the first process goes on alone.
     """
     check_writable(options.run.policies)
     tasks = {policy.place: policy.task() for policy in policies}.values()
@@ -116,7 +121,7 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     for policy in policies if world_size() > 1 else ():
         try:
             train(policy)
-        except (FloatingPointError, ValueError) as error:  # in all processes alike
+        except (FloatingPointError, ValueError) as error:  # raised in all processes
             failures[str(policy)] = str(error)
             print(f"FAILED {policy}: {error}", flush=True)
     go_on_alone()
@@ -130,27 +135,26 @@ def submit(
     evaluation: Evaluation,
     add: Callable[[dict[str, Any]], None],
 ) -> None:
-    """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
-    last, was_there = policy.training.iterations, policy.is_trained
+    """Submit the jobs that train, measure and play a policy; `add` gets the row of each complete cell."""
+    last, was_trained = policy.training.iterations, policy.is_trained
     episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
-    measures: dict[int, dict[str, Any]] = {}  # by NFE, of the last checkpoint; others are only played
+    measures: dict[int, dict[str, Any]] = {}  # of the last checkpoint, by NFE; earlier ones are only played
 
-    def trained(nothing: None) -> None:
-        jobs.say(f"{'found' if was_there else 'trained'} {policy}, {last} iterations")
+    def trained(result: None) -> None:
+        jobs.say(f"{'found' if was_trained else 'trained'} {policy}, {last} iterations")
 
-    def measured(found: dict[int, dict[str, Any]]) -> None:
-        measures.update(found)
+    def measured(measures_by_nfe: dict[int, dict[str, Any]]) -> None:
+        measures.update(measures_by_nfe)
         for cell in [cell for cell in cells if cell.checkpoint == last]:
             played(cell, [])
 
-    def played(cell: Cell, found: list[Episode]) -> None:
-        mine = episodes[cell]
-        mine += found
-        at_end = cell.checkpoint == last
-        if len(mine) == evaluation.episodes and (measures or not at_end):
-            made = row(policy, cell, mine, measures.get(cell.nfe, {}) if at_end else {})
-            add(made)
-            jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
+    def played(cell: Cell, new_episodes: list[Episode]) -> None:
+        episodes[cell] += new_episodes
+        count, at_end = len(episodes[cell]), cell.checkpoint == last
+        if count == evaluation.episodes and (measures or not at_end):
+            complete = row(policy, cell, episodes[cell], measures.get(cell.nfe, {}) if at_end else {})
+            add(complete)
+            jobs.say(f"played {policy}, {cell}: {complete['successes']} of {count} episodes solved")
 
     group = str(policy)
     training: dict[str, Any] = {"training": True, "status": policy.status, "then": trained, "group": group}
@@ -160,5 +164,5 @@ def submit(
         jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
     for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
-        more, few = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
-        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, few, **more)
+        job_options, job_seeds = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
+        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, job_seeds, **job_options)

@@ -1,4 +1,4 @@
-"""The official files of robomimic and MimicGen."""
+"""Downloads of the official files of robomimic and MimicGen."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
-"""The hub's dataset repositories that hold robomimic's files, in the order of trying."""
+"""Dataset repositories of the hub with robomimic's files, in the order in which they are tried."""
 
 OFFICIAL = {
     **dict.fromkeys(("lift", "can", "square", "transport"), ("ph", "mh")),
     "tool_hang": ("ph",),
     **dict.fromkeys(("stack_d0", "coffee_d0", "threading_d0"), ("source", "core")),
 }
-"""The styles of the data that robomimic or MimicGen publish for a task."""
+"""The styles of data that robomimic or MimicGen publish, by task."""
 
 MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
-"""The one that holds MimicGen's, under the licence CC BY-NC-SA 4.0."""
+"""The dataset repository of MimicGen's files, under the licence CC BY-NC-SA 4.0."""
 
 
 def download_robomimic(
     task: str, style: str | None = None, *, root: str | Path | None = None, force: bool = False
 ) -> Path:
-    """Download an official low-dimensional file of robomimic or MimicGen, unless it is there already.
+    """Download an official low-dimensional file of robomimic or MimicGen, unless it is already here.
 
-    robomimic's is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
-    delivers it, and MimicGen's ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
+    robomimic's file is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` from the first of :data:`REPOSITORIES` that
+    delivers it. MimicGen's is, for example, ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` from
     :data:`MIMICGEN_REPOSITORY`, whose licence, CC BY-NC-SA 4.0, excludes commercial use. The file, whose path
-    is returned, is opened and compared with the digest that the hub gives, where that can be reached; one
-    that fails is fetched once more.
+    is returned, is opened and, if the hub can be reached, compared with the hub's digest. A damaged file is
+    downloaded once more.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``; ``stack_d0``, ``coffee_d0`` or
             ``threading_d0`` of MimicGen.
-        style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators); of MimicGen ``"source"`` (ten
-            human demonstrations) or ``"core"`` (a thousand that MimicGen made of them). The former by
-            default.
-        root: the folder under which to keep the file; by default the hub client's cache.
-        force: download again even if the file is there.
+        style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators); for MimicGen ``"source"`` (ten
+            human demonstrations) or ``"core"`` (a thousand that MimicGen made from them). The first of each
+            pair by default.
+        root: folder for the file; by default the hub client's cache.
+        force: download again, even if the file is here.
 
     Raises:
         ValueError: if there is no official file of the task or style.
-        OSError: if no repository delivers a readable file; names every attempt and its cause.
+        OSError: if no repository delivers a readable file; it names every attempt and its cause.
 
     Examples:
         >>> from lab.downloads import download_robomimic
@@ -68,21 +68,21 @@ def download_robomimic(
         raise ValueError(f"{task} has no official {style!r} data; it has: {', '.join(official[task])}")
     if not is_mimicgen(TASKS[task].env_name):
         return _download(f"v1.5/{task}/{style}/low_dim_v15.hdf5", REPOSITORIES, root, force)
-    # The human demonstrations belong to the task, those made of them to a variant of it.
+    # Human demonstrations are published per task, generated ones per variant of a task.
     name = task.removesuffix("_d0") if style == "source" else task
     return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, force)
 
 
 def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
-    """Fetch and check a file of the first repository that delivers it."""
+    """Download and check a file from the first repository that delivers it."""
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")
     failures: list[str] = []
     for repository in repositories:
         where = {"repo_id": repository, "filename": name, "repo_type": "dataset"}
-        for anew in dict.fromkeys((force, True)):  # a damaged copy is fetched once more
+        for again in dict.fromkeys((force, True)):  # a damaged copy is downloaded once more
             try:
-                path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
+                path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=again))
                 published = _published_digest(hub, where)
                 if published is not None and file_digest(path) != published:
                     raise DatasetError(
@@ -91,8 +91,8 @@ def _download(name: str, repositories: Sequence[str], root: str | Path | None, f
                     )
                 with open_robomimic(path):
                     return path
-            # The client's failures share no base class: its own errors, those of the HTTP library
-            # underneath, and OSError for a broken connection, a full disk or a short file.
+            # Errors of the client share no base class: there are its own, those of its HTTP library, and
+            # OSError for a broken connection, a full disk or a short file.
             except Exception as error:
                 cause = error
                 if not isinstance(error, DatasetError):
@@ -101,15 +101,15 @@ def _download(name: str, repositories: Sequence[str], root: str | Path | None, f
     raise OSError(
         f"could not download {name}:\n- "
         + "\n- ".join(failures)
-        + "\nCheck the connection; force=True replaces a broken local copy, and a file fetched by "
-        "other means can be given by its path."
+        + "\nCheck the connection; force=True replaces a broken local copy, and a file from elsewhere can be "
+        "given by its path."
     ) from cause
 
 
 def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
-    """SHA-256 of a file at the hub; ``None`` if the hub cannot be reached or gives another kind."""
+    """Return the SHA-256 of a file at the hub; ``None`` if the hub has none or cannot be reached."""
     try:
         etag = hub.get_hf_file_metadata(hub.hf_hub_url(**where)).etag
-    except Exception:  # without a connection, what is there has to do
+    except Exception:  # without a connection the local copy is used unchecked
         return None
     return etag if etag is not None and len(etag) == 64 else None

@@ -1,4 +1,4 @@
-"""Files of results, the cache of what is generated, and what may go wrong in part."""
+"""Files of results, the cache of generated files, and errors of runs that failed in part."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from warmprior.io.files import check_regular
 
 
 class PartialFailure(RuntimeError):
-    """Some of the work failed; the rest of it is done and written down."""
+    """Raised if some of the work failed; the rest is done and saved."""
 
 
 ERRORS = (*script.ERRORS, PartialFailure)
-"""Errors that a user can mend are reported without a traceback."""
+"""Errors that a user can mend; they are reported without a traceback."""
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read a file of JSON objects, one per line; a ``ValueError`` that names the line that is damaged."""
+    """Read a file of JSON objects, one per line; a ``ValueError`` names a damaged line."""
     check_regular(path)
     records = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):

@@ -1,12 +1,12 @@
-"""Jobs of a benchmark: functions that fresh processes of this machine (loky), or a Ray cluster, compute.
+"""Jobs of a benchmark: function calls that run in fresh processes of this machine (loky), or on Ray.
 
     with Jobs(run) as jobs:
         trained = jobs.submit("train", train, policy)
         jobs.submit("play", play, policy, after=trained, then=print)
         failures = jobs.wait()
 
-A job is a function of an importable module whose result is small, or a file that it finds again when it is
-called once more. So a worker that dies costs its own job alone, and nothing is stored here.
+The function must be importable. Its result is small, or a file that it finds when it is called again. So a
+worker that dies costs only its own job, and nothing is stored here.
 """
 
 from __future__ import annotations
@@ -29,51 +29,51 @@ from lab.files import ERRORS
 from lab.options import Run
 from lab.workers import available_cores, fresh_processes
 
-DEATHS = 3  # workers that a job may lose before it counts as failed
-LINES_EVERY = 30.0  # seconds between two reports on running trainings where there is no terminal
+DEATHS = 3  # number of dead workers after which a job counts as failed
+LINES_EVERY = 30.0  # seconds between reports on running trainings, without a terminal
 
 
 @dataclass(eq=False)
 class Job:
-    """One call of a function."""
+    """A call of a function."""
 
     name: str
     function: Callable[..., Any]
     args: tuple[Any, ...]
-    after: Job | None = None  # it starts once this one is done
-    group: str = ""  # after a failure, the other jobs of its group are left out
-    then: Callable[[Any], object] | None = None  # called here with the result
-    training: bool = False  # it is long, and takes a GPU if there is one
-    status: Path | None = None  # where it reports its progress: {"iteration": ..., "iterations": ...}
+    after: Job | None = None  # the job that must be done first
+    group: str = ""  # jobs that are left out if one of them fails
+    then: Callable[[Any], object] | None = None  # called in this process with the result
+    training: bool = False  # a long job, which takes a GPU if there is one
+    status: Path | None = None  # file of its progress: {"iteration": ..., "iterations": ...}
     deaths: int = 0
     done: bool = False
 
     def iterations(self) -> tuple[int, int] | None:
-        """How many iterations of a training are done, of how many."""
+        """Return the number of finished iterations of a training, and of all; None if unknown."""
         try:
             status = json.loads(self.status.read_text()) if self.status else {}
             return status["iteration"], status["iterations"]
-        except (OSError, ValueError, KeyError):  # none yet, or another machine is writing it
+        except (OSError, ValueError, KeyError):  # not written yet, or being written by another machine
             return None
 
 
 def call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
-    """In a worker: the result, or why there is none, as text: some exceptions cannot be pickled."""
+    """Call a function in a worker; return its result, or its error as text, which can be pickled."""
     import torch
 
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision("high")
     try:
         return function(*args), None
-    except (Exception, SystemExit) as error:  # code of a user's may call sys.exit
+    except (Exception, SystemExit) as error:  # a user's code may call sys.exit
         if not isinstance(error, ERRORS):
-            traceback.print_exc()  # nothing that a user can mend
+            traceback.print_exc()  # not an error that a user can mend
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
         return None, repr(error) if isinstance(error, SystemExit) else str(text) or repr(error)
 
 
 class Local:
-    """Processes of this machine, one thread each; the first ones have a GPU each, where one is asked for."""
+    """Processes of this machine, with one thread each; for CUDA the first ones have one GPU each."""
 
     def __init__(self, workers: int | None, device: str) -> None:
         self._gpus = _gpus(device)
@@ -88,29 +88,29 @@ class Local:
         return free[-1] if free else None
 
     def takes(self, job: Job) -> bool:
-        """Whether a process is free, with a GPU where the job trains on one."""
+        """Return True if a process is free, with a GPU if the job needs one."""
         return self._slot(job) is not None
 
     def submit(self, job: Job) -> Future[Any]:
-        """Start it in a free process, which is started with its first job."""
+        """Start a job in a free process; a process starts with its first job."""
         slot = self._slot(job)
-        assert slot is not None, "takes(job) says so"
+        assert slot is not None, "submit is called after takes(job)"
         try:
             self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
-        except (KeyError, BrokenProcessPool):  # none yet, or it died with an earlier job
+        except (KeyError, BrokenProcessPool):  # not started, or killed by an earlier job
             env = {"CUDA_VISIBLE_DEVICES": "".join(self._gpus[slot : slot + 1])}
             self._pools[slot] = fresh_processes(1, env=env if self._gpus else None)
             self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
         return self._busy[slot]
 
     def close(self, kill: bool) -> None:
-        """End the processes: what they have done is in files, or was given back."""
+        """End the processes; results are in files, or were returned."""
         for pool in self._pools.values():
             pool.shutdown(kill_workers=kill)
 
 
 def _gpus(device: str) -> list[str]:
-    """The GPUs that --device names, as CUDA_VISIBLE_DEVICES takes them."""
+    """Return the GPUs of --device, in the form of CUDA_VISIBLE_DEVICES."""
     kind, _, index = device.partition(":")
     if kind != "cuda":
         return []
@@ -142,14 +142,14 @@ class Ray:
 
     def submit(self, job: Job) -> Future[Any]:
         gpus = float(job.training and self._device.startswith("cuda"))
-        # Lost ones are started again by `Jobs`, here as on one machine.
+        # `Jobs` restarts lost tasks itself.
         options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": 0}
         task = self._task.options(**options).remote(job.function, job.args)
         self._running[future := task.future()] = task
         return future
 
     def close(self, kill: bool) -> None:
-        """Cancel what runs, and leave the cluster."""
+        """Cancel running tasks, and disconnect from the cluster."""
         for future, task in self._running.items():
             if not future.done():
                 self._ray.cancel(task, force=True)
@@ -157,17 +157,17 @@ class Ray:
 
 
 class Jobs:
-    """Jobs of one run.
+    """The jobs of a run.
 
-    The first that is ready starts first, but the last trainings start before everything else: they take
-    longest, and nothing should wait for them in the end.
+    Jobs start in the order in which they are ready. Only the last trainings go before all others, because
+    they take longest and would otherwise run alone at the end.
     """
 
     def __init__(self, run: Run) -> None:
-        # Either says what it `takes`, starts it (a future that raises if the worker dies), and closes.
+        # The future of `submit` raises if the worker dies.
         self.engine: Local | Ray = Ray(run) if run.engine == "ray" else Local(run.envs, run.device)
         self._waiting: list[Job] = []
-        self._failed: dict[str, str] = {}  # by group, why
+        self._failed: dict[str, str] = {}  # reasons by group
         self._spoke = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -185,15 +185,15 @@ class Jobs:
         return job
 
     def say(self, line: str) -> None:
-        """Print a line that stays above the bar."""
+        """Print a line above the progress bar."""
         tqdm.write(line)
         sys.stdout.flush()
 
     def wait(self) -> dict[str, str]:
-        """Compute all jobs; what failed, by group, and why."""
+        """Run all jobs; return the reasons of failures by group."""
         running: dict[Future[Any], Job] = {}
         ended = 0
-        # disable=None: no bar without a terminal.
+        # disable=None shows no bar without a terminal.
         with tqdm(desc="jobs", leave=False, dynamic_ncols=True, disable=None) as bar:
             while self._waiting or running:
                 while (job := self._next()) is not None:
@@ -208,7 +208,7 @@ class Jobs:
         return self._failed
 
     def _show(self, bar: tqdm, running: Iterable[Job]) -> None:
-        """How far the trainings are: in the bar, or where there is none, in lines now and then."""
+        """Show the progress of trainings in the bar, or print it now and then without a terminal."""
         trainings = {job.name: done for job in running if (done := job.iterations())}
         bar.set_postfix_str(", ".join(f"training {n / total:.0%}" for n, total in trainings.values()))
         if bar.disable and time.monotonic() - self._spoke > LINES_EVERY:
@@ -217,7 +217,7 @@ class Jobs:
                 print(f"{name}: {n:,} of {total:,} iterations", flush=True)
 
     def _next(self) -> Job | None:
-        """The job that starts now, if one can."""
+        """Return the job to start now, if there is one."""
         ready = [
             job for job in self._waiting if (job.after is None or job.after.done) and self.engine.takes(job)
         ]
@@ -227,7 +227,7 @@ class Jobs:
         return ready[0] if ready else None
 
     def _ended(self, job: Job, future: Future[Any]) -> int:
-        """Take note of a job whose future is done; how many jobs that settles."""
+        """Handle a job whose future is done; return the number of jobs that ended with it."""
         try:
             result, reason = future.result()
         except Exception as error:  # the worker died
@@ -237,7 +237,7 @@ class Jobs:
                 return 0
             result, kind = None, type(error).__name__
             reason = f"its worker died {job.deaths} times ({kind}), perhaps for lack of memory: use fewer "
-            reason += "with --envs"
+            reason += "workers with --envs"
         if reason is None:
             job.done = True
             if job.then is not None:

@@ -1,4 +1,4 @@
-"""The first of several processes generates or downloads for all of them."""
+"""Work that the first of several processes does for all of them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from warmprior.io.distributed import from_leader, rank
 
 @contextmanager
 def leader_first() -> Iterator[None]:
-    """Let the first process do something before the others, which find it done.
+    """Run a block in the first process, and afterwards in the others, which find the work done.
 
-    If that ends in a `FloatingPointError` or `ValueError`, which end a training and not the run, all get it.
-    After any other error, which the first process reports, the others get a `SystemExit`.
+    A `FloatingPointError` or `ValueError` of the first process is raised in all, because it ends only a
+    training. After any other error, which the first process reports, the others raise `SystemExit`.
     """
     failure: BaseException | None = SystemExit(2)
     try:
@@ -35,7 +35,7 @@ def leader_first() -> Iterator[None]:
 
 
 def go_on_alone() -> None:
-    """Let the first process go on as if it had been started alone, and the others end, with success."""
+    """End all processes but the first, which goes on as if it had been started alone."""
     ends = bool(rank())
     from_leader(int)  # all have arrived
     if dist.is_initialized():

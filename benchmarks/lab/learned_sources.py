@@ -1,4 +1,4 @@
-"""Sources of other papers that learn from the demonstrations before the flow does, and how they learn."""
+"""Sources of other papers that are trained on the demonstrations before the flow, and their training."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ CALIBRATION_WINDOWS = 4_096
 
 
 class Learner(nn.Module):
-    r"""A network :math:`f_\phi(o, h)` of observation and last ``H`` actions that learns by a loss of its own.
+    r"""A network :math:`f_\phi(o, h)` of observation and last ``H`` actions with a loss of its own.
 
-    It learns on the windows that the flow will be trained on (:func:`learn`), and is fixed from then on. The
-    last actions count once there are ``H`` of them. Subclasses are sources or start points as well.
-    Observations are single tensors.
+    It is trained on the windows of the flow (:func:`learn`), and fixed afterwards. The last actions are read
+    once there are ``H`` of them. Subclasses are also sources or start points. Observations are single
+    tensors.
     """
 
     sees_history: ClassVar[bool] = True
     sees_observation: ClassVar[bool] = True
-    heads: ClassVar[int] = 1  # chunks that the network says
+    heads: ClassVar[int] = 1  # number of chunks that the network predicts
     chunk_length: int
     chunk_dim: int  # numbers in a chunk, H d_a
-    seen_dim: int  # numbers that the network is given
+    seen_dim: int  # numbers in the network's input
 
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
-        """Make the networks, if the widths of the data are known."""
+        """Set the widths and make the networks; without widths, only note the width of hidden layers."""
         check_whole_numbers(hidden_dim=hidden_dim)
         self.widths, self.hidden_dim = widths, hidden_dim
         if widths is not None:
@@ -56,35 +56,36 @@ class Learner(nn.Module):
         self.network = self.mlp(self.seen_dim, self.heads * self.chunk_dim)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        """What the networks minimise on windows; the error of their forecast by default."""
+        """Return the loss of the networks on windows; by default the mean squared error."""
         predicted = self.predicted(windows[keys.HISTORY], windows[keys.OBSERVATION])
         return inside_mean(windows, (windows[keys.CHUNK] - predicted).square())
 
     def calibrate(self, windows: TensorDictBase) -> None:
-        """Correct the source by its error on windows that were held out; nothing by default."""
+        """Correct the source by its error on held-out windows; by default do nothing."""
 
     def mlp(self, inputs: int, outputs: int) -> MLP:
         return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
 
     def seen(self, history: TensorDictBase, observation: Any) -> Tensor:
-        """What the network is given, ``[*B, seen_dim]``."""
+        """Return the input of the network, ``[*B, seen_dim]``."""
         parts = [observation.flatten(-2)] if self.sees_observation else []
         if self.sees_history:
-            known = history["steps"] >= self.chunk_length
+            full = history["steps"] >= self.chunk_length
             actions = history["actions"][..., -self.chunk_length :, :]
-            parts.append(torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2))
-            parts.append(known.to(actions.dtype))
+            parts.append(torch.where(full.unsqueeze(-1), actions, 0.0).flatten(-2))
+            parts.append(full.to(actions.dtype))
         return torch.cat(parts, -1)
 
     def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """The chunks that the network says, ``[*B, H, d_a]``, with several heads ``[*B, heads H, d_a]``."""
+        """Return the predicted chunks, ``[*B, H, d_a]``, with several heads ``[*B, heads H, d_a]``."""
         return self.network(self.seen(history, observation)).unflatten(-1, (-1, self.action_dim))
 
 
 class LearnedPrior(PastPrior, Learner, abstract=True):
-    """A learned source around which agents can search: warm where the network is, that is everywhere.
+    """Base class of learned sources around which agents can search; all positions are warm.
 
-    `widths` are ``d_a``, ``d_o`` and ``To``, known once there are data; `hidden_dim` is of both layers.
+    `widths` are ``d_a``, ``d_o`` and ``To``, known once there are data; `hidden_dim` is the width of both
+    hidden layers.
     """
 
     def __init__(
@@ -111,9 +112,8 @@ class ForecastPrior(LearnedPrior):
         \min_\phi E\left[\log s_\phi + \tfrac12 (a_1 - \mu_\phi)^2 / s_\phi^2\right],
 
     per position and dimension. Afterwards :math:`s_\phi` is multiplied, per position and dimension, by the
-    root mean square of :math:`(a_1 - \mu_\phi) / s_\phi` on episodes that were held out: a source that errs
-    more than it thinks is widened until it errs as it says, and one that errs less is narrowed, down to 0.02.
-    ``sigma`` multiplies the result.
+    root mean square of :math:`(a_1 - \mu_\phi) / s_\phi` on held-out episodes: a scale smaller than the error
+    is widened, and one larger than the error is narrowed, down to 0.02. ``sigma`` multiplies the result.
     """
 
     calibration: Tensor
@@ -131,7 +131,7 @@ class ForecastPrior(LearnedPrior):
         return (self.calibration * scale).clamp_min(SCALE_FLOOR)
 
     def _gaussian(self, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Mean and scale before the calibration."""
+        """Return mean and scale before the calibration."""
         mean, raw = self.predicted(history, observation).chunk(2, -2)
         return mean, SCALE_FLOOR + nn.functional.softplus(raw)
 
@@ -144,13 +144,13 @@ class ForecastPrior(LearnedPrior):
         return inside_mean(windows, scale.log() + 0.5 * ((windows[keys.CHUNK] - mean) / scale).square())
 
     def calibrate(self, windows: TensorDictBase) -> None:
-        """Scale by the root mean square of the standardised error, and note what scale that gives."""
+        """Set the calibration to the RMS of the standardised error, and note the resulting scale."""
         mean, scale = self._gaussian(windows[keys.HISTORY], windows[keys.OBSERVATION])
         counted = ~windows[keys.IS_PAD].unsqueeze(-1)
         squared = ((windows[keys.CHUNK] - mean) / scale).square() * counted
-        known = counted.sum(0).clamp_min(1)
-        found = torch.where(counted.any(0), squared.sum(0) / known, 1.0)
-        self.calibration.copy_(found.sqrt())
+        count = counted.sum(0).clamp_min(1)
+        variance = torch.where(counted.any(0), squared.sum(0) / count, 1.0)
+        self.calibration.copy_(variance.sqrt())
         self.typical_scale.copy_(inside_mean(windows, self._calibrated(scale).square()).sqrt())
 
 
@@ -162,11 +162,11 @@ class LeapPrior(ForecastPrior):
 
 
 class A2APrior(LearnedPrior):
-    r"""A2A in action space: a deterministic source :math:`a_0 = f_\phi(h)` made of the last actions alone.
+    r"""A2A in action space: a deterministic source :math:`a_0 = f_\phi(h)` from the last actions alone.
 
     A2A (Jia et al., 2026) encodes a history into the source of a flow between latent codes of chunks, without
-    any noise. Here the code of a chunk is the chunk itself, the history that of WP-Past, and :math:`f_\phi`
-    learns by mean squared error to be near the target before the flow does.
+    any noise. Here the code of a chunk is the chunk itself, the history is that of WP-Past, and
+    :math:`f_\phi` is trained to predict the target by mean squared error before the flow is trained.
     """
 
     name = "a2a"
@@ -180,7 +180,7 @@ class A2APrior(LearnedPrior):
 
 @dataclass(frozen=True)
 class Drawn(Source):
-    """A source that is drawn in a way of its own."""
+    """A source with its own way of sampling."""
 
     by: Any = None  # a function of a generator and the temperature
 
@@ -197,9 +197,9 @@ class CVAEPrior(LearnedPrior):
         + \beta \frac{d_z}{D} \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
 
     with :math:`D = P d_a` coordinates of a chunk and :math:`d_z` of ``z``; the first term is the mean over
-    the coordinates inside the episode (Chen et al., 2024). The flow from it is that of every other prior;
-    BRIDGER's own path adds noise between the ends and is sampled as a stochastic differential equation. The
-    source is no Gaussian and has no mean: agents search around zero. `latent_dim` is the width of ``z``.
+    the coordinates inside the episode (Chen et al., 2024). The flow is the same as for other priors, while
+    BRIDGER's path adds noise between the ends and is sampled as a stochastic differential equation. The
+    source is not Gaussian and has no mean, so agents search around zero. `latent_dim` is the width of ``z``.
     """
 
     name = "cvae"
@@ -225,46 +225,46 @@ class CVAEPrior(LearnedPrior):
         self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
         self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
 
-    def decode(self, seen: Tensor, z: Tensor) -> Tensor:
-        return self.decoder(torch.cat([seen, z], -1)).unflatten(-1, (-1, self.action_dim))
+    def decode(self, inputs: Tensor, z: Tensor) -> Tensor:
+        return self.decoder(torch.cat([inputs, z], -1)).unflatten(-1, (-1, self.action_dim))
 
-    mean = GaussianPrior.mean  # none: cold everywhere
+    mean = GaussianPrior.mean  # cold everywhere
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """One that decodes a latent of its own for every draw: Gaussian given that, and none without."""
-        source, seen = super().distribution(history, observation), self.seen(history, observation)
+        """Return a source that decodes a new latent for every sample; it is Gaussian given the latent."""
+        source, inputs = super().distribution(history, observation), self.seen(history, observation)
 
         def decoded(generator: torch.Generator | None, temperature: float) -> Tensor:
             like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
-            z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
-            loc = self.decode(seen, z if temperature == 1.0 else temperature * z)
+            z = torch.randn((*inputs.shape[:-1], self.latent_dim), generator=generator, **like)
+            loc = self.decode(inputs, z if temperature == 1.0 else temperature * z)
             return replace(source, loc=loc, scale=loc.new_tensor(self.sigma)).sample(generator, temperature)
 
         return Drawn(source.loc, source.scale, source.warm, by=decoded)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        inputs = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])
         inside = ~windows[keys.IS_PAD].unsqueeze(-1)
-        found = self.encoder(torch.cat([seen, (windows[keys.CHUNK] * inside).flatten(-2)], -1))
-        mean, log_variance = found.chunk(2, -1)
+        encoded = self.encoder(torch.cat([inputs, (windows[keys.CHUNK] * inside).flatten(-2)], -1))
+        mean, log_variance = encoded.chunk(2, -1)
         eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
         z = mean + (0.5 * log_variance).exp() * eps
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
-        error = inside_mean(windows, (windows[keys.CHUNK] - self.decode(seen, z)).square())
+        error = inside_mean(windows, (windows[keys.CHUNK] - self.decode(inputs, z)).square())
         return error + self.beta * divergence / self.chunk_dim * self.latent_dim
 
 
 class ForecastStart(StartPoint, Learner):
     r"""STEP: a forecast enters the flow of a standard normal source at an intermediate time.
 
-    The flow is trained as ever, from N(0, I). At decisions a forecaster :math:`f_\phi(o, h)`, trained by mean
-    squared error, gives
+    The flow is trained as usual, from N(0, I). At decisions a forecaster :math:`f_\phi(o, h)`, trained by
+    mean squared error, gives
 
     .. math::
         a_{t_s} = (1 - t_s) \varepsilon + t_s f_\phi(o, h),
 
-    from which the flow is integrated to ``t = 1`` (Li et al., 2026). Where the forecast stays where the last
-    chunk was (root mean square distance per coordinate below ``stall``, in normalised action units), the
+    from which the flow is integrated to ``t = 1`` (Li et al., 2026). If the forecast hardly differs from the
+    last chunk (root mean square distance per coordinate below ``stall``, in normalised action units), the
     robot may be stuck, and the noise is multiplied by ``1 + stall_noise`` (velocity-aware noise).
     """
 
@@ -291,21 +291,21 @@ class ForecastStart(StartPoint, Learner):
         self._set_widths(widths, hidden_dim)
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """Share of the forecast."""
+        """Return the forecast times the start time."""
         return self.time * self.predicted(history, observation)
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """Noise and forecast, mixed as on the path at ``start_time``."""
+        """Return noise and forecast, mixed as on the path at ``start_time``."""
         forecast = self.predicted(history, observation)
         last = history["actions"][..., -self.chunk_length :, :]
         moved = (forecast - last).square().mean((-1, -2), keepdim=True).sqrt()
-        known = (history["steps"] >= self.chunk_length).unsqueeze(-1)
-        noise = torch.where(known & (moved < self.stall), (1 + self.stall_noise) * noise, noise)
+        full = (history["steps"] >= self.chunk_length).unsqueeze(-1)
+        noise = torch.where(full & (moved < self.stall), (1 + self.stall_noise) * noise, noise)
         return (1 - self.time) * noise + self.time * forecast
 
 
 def inside_mean(windows: TensorDictBase, values: Tensor) -> Tensor:
-    """Mean over the coordinates of a chunk inside the episode; 0 if no position is inside."""
+    """Return the mean over the coordinates of a chunk inside the episode; 0 if none is inside."""
     counted = (~windows[keys.IS_PAD]).unsqueeze(-1).expand_as(values)
     return (values * counted).sum() / counted.sum().clamp_min(1)
 
@@ -320,14 +320,14 @@ def learn(
     withhold: float = 0.0,
     seed: int = 0,
 ) -> None:
-    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from.
+    """Train the networks of a learner in place, and calibrate it on held-out episodes.
 
-    These are every tenth, or of fewer the second.
+    Every tenth episode is held out; with fewer than ten episodes, the second.
     """
-    data = without_images(data)  # no learner sees them
+    data = without_images(data)  # learners see no images
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]
-    apart = number % 10 == 9 if int(number.max()) >= 9 else number == 1
+    is_held_out = number % 10 == 9 if int(number.max()) >= 9 else number == 1
     device = data.device or torch.device("cpu")
     generator = torch.Generator(device).manual_seed(seed)
 
@@ -345,7 +345,7 @@ def learn(
         torch.manual_seed(seed)
         learner.build()
         learner.to(device)
-    buffer = windows(data[~apart], 256)
+    buffer = windows(data[~is_held_out], 256)
     learner.requires_grad_(True).train()
     optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=1e-2, fused=True)
     schedule = warmup_cosine(optimizer, iterations, 0.1)
@@ -360,6 +360,6 @@ def learn(
         raise FloatingPointError(
             f"the networks of {type(learner).__name__} became NaN or infinite: lower the learning rate"
         )
-    unseen = data[apart] if bool(apart.any()) else data
+    held_out = data[is_held_out] if bool(is_held_out.any()) else data
     with torch.no_grad():
-        learner.calibrate(windows(unseen, CALIBRATION_WINDOWS).sample())
+        learner.calibrate(windows(held_out, CALIBRATION_WINDOWS).sample())

@@ -1,4 +1,4 @@
-"""This file describes the machine, and checks that a device works on it."""
+"""Description of the machine, and the check of a device."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco"
 
 
 def facts_of_machine(**more: Any) -> dict[str, Any]:
-    """Versions and hardware, as files of results keep them."""
+    """Return versions and hardware, which files of results keep."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
             versions[package] = version(package)
         except PackageNotFoundError:
-            continue  # an extra that this run does without
+            continue  # an optional package that is not installed
     hardware = {"machine": platform.machine(), "cores": os.cpu_count(), **more}
     if torch.cuda.is_available():
         hardware["gpu"] = torch.cuda.get_device_name()
@@ -29,20 +29,20 @@ def facts_of_machine(**more: Any) -> dict[str, Any]:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device, such as ``"cuda"`` for one each, that not every process here has, or that fails."""
+    """Raise ValueError if a device, such as ``"cuda"``, is missing for a process or does not work."""
     try:
         if torch.device(device).type == "cuda" and launched():
             local, devices = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
             if torch.device(device).index is not None:
                 raise ValueError(
-                    f"--device {device}: under torchrun every process takes a GPU of its own: --device cuda"
+                    f"--device {device}: under torchrun every process takes its own GPU: write --device cuda"
                 )
             if local > devices:
                 raise ValueError(
                     f"--device {device}: {local} processes on a machine with {devices} CUDA device(s): start "
                     f"torchrun with --nproc-per-node {devices}"
                 )
-        # Computed and read: there are devices that can only be named, such as meta.
+        # Compute and read a value: some devices exist only by name, such as meta.
         torch.ones(1, device=device).add(1).item()
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]

@@ -1,4 +1,4 @@
-"""What is measured of policies beside their success: leak, memory, and the shape of their flow."""
+"""Measures of policies other than success: source leak, memory gain, and the shape of their flow."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from warmprior.keys import EPISODE, OBSERVATION, STATE
 from warmprior.modules.network import device_of
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
-HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
+HELD_OUT_SEED = 50  # seed of generated held-out demonstrations; training data have seed 0
 
 TRAINED_ON = "the TRAINING demonstrations (not held out)"
 
-# Ratios to the baseline: the entry of `curvature` that each compares.
+# By name, the entry of `curvature` that is divided by the first policy's.
 RATIOS = {
     "ratio": "kappa",
     "ratio_executed": "kappa_executed",
@@ -49,27 +49,27 @@ RATIOS = {
 }
 
 
-def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float | None]]:
-    """Measure a policy on its training data, by NFE: on the same observations and draws for all."""
+def measure(trained: Policy, nfe: Sequence[int]) -> dict[int, dict[str, float | None]]:
+    """Return the measures of a policy on its training data, by NFE; all policies get the same draws."""
     policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
-    nfes, observation_steps = method.nfes(asked), trained.network.observation_steps
+    nfes, observation_steps = method.nfes(nfe), trained.network.observation_steps
     shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
     windows = shared.windows(policy.prior, see_history=policy.sees_history)
-    seen = encoded_windows(policy, windows)
+    encoded = encoded_windows(policy, windows)
     leaks: Mapping[int, Any] = {}
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
-        leaks = source_leak(policy, seen, nfes=nfes, episodes=shared.episodes)
+        leaks = source_leak(policy, encoded, nfes=nfes, episodes=shared.episodes)
     generator = torch.Generator().manual_seed(0)
     met = shared.met(policy, generator=generator)
     allowed = allowed_nfes(policy, nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
-    gains = memory_gain(policy, windows if policy.sees_history else seen, nfes=nfes)
-    # How straight the flow is between source and targets, over the executed H.
+    gains = memory_gain(policy, windows if policy.sees_history else encoded, nfes=nfes)
+    # The curvature of the flow between source and targets, over the executed positions.
     kappa, relative = math.nan, math.nan
     if policy.sampling.max_nfe is None:
-        with warnings.catch_warnings():  # the NaN says that something does not move
+        with warnings.catch_warnings():  # NaN marks a field that does not move
             warnings.simplefilter("ignore")
             values = curvature(policy, met, generator=generator)
         kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
@@ -93,7 +93,7 @@ def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float 
 
 
 def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
-    """Bound of the branching cost, whole and executed; NaN where it does not apply."""
+    """Return the bound of the branching cost, over all and over executed positions; NaN if there is none."""
     if not coupled:
         try:
             bound = branching_bound(batch, prior)
@@ -104,48 +104,51 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 
 def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
-    """Observations that no policy of a task was trained on, and what they are in words.
+    """Return held-out observations of a policy's task, and a description of them.
 
-    A task of one's own has none: its training data. A ``ValueError`` if some of them were trained on: masks
-    may overlap, and files may have demonstrations in common.
+    For a user's task they are its training data.
+
+    Raises:
+        ValueError: if there are no held-out data, or some of them were trained on (masks may overlap, and
+            files may have demonstrations in common).
     """
     place: Path | str
     task, chunk_length = policy.task(), policy.method.chunk_length
     facts, device, count = task.facts, options.run.device, options.observations
-    given, mask = options.validation, None
+    validation, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
     shape: dict[str, Any] = {"observation_steps": policy.network.observation_steps}
     if task.normalizer is None or "file" not in facts:
-        if given is not None:
-            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
+        if validation is not None:
+            raise ValueError(f"--validation is for robosuite's tasks: leave it out with {task.name}")
         shared = SharedObservations(task.data.to(device), chunk_length, **shape)
         if len(shared) > count:
             shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
         return shared, TRAINED_ON
-    if given is not None:
-        place, words = given, ""
+    if validation is not None:
+        place, words = validation, ""
     elif policy.data.mask == "train":
         place, words, mask = demonstrations_of(policy.data, task.name, task.style)[0], "", "valid"
     elif facts.get("source") != "scripted":
         raise ValueError(
-            f"these policies are trained on {facts['file']}: train them with --mask train, to measure "
-            "on the part of the file that is called valid, or add --validation FILE with others (or with the "
-            "same file, to measure on the training data)"
+            f"the policies are trained on all of {facts['file']}: train them with --mask train, to measure "
+            "on the file's mask valid, or add --validation FILE with other demonstrations (or with the same "
+            "file, to measure on the training data)"
         )
     else:
-        # As many as the training demonstrations suggest, with room to spare.
+        # Enough demonstrations for the observations, judged by the length of the training demonstrations.
         usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
         episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
         place = generate_demonstrations(task.name, task.style, episodes, HELD_OUT_SEED)
         words = f"{episodes} newly generated demonstrations"
     data, called = read_like(place, task.name, facts, mask)
-    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
+    # A copy, because the data are normalised on the CPU and the policy may be on another device.
     data = copy.deepcopy(task.normalizer).to("cpu").normalize(data)
-    trained, found = (set(_episodes(part)) for part in (task.data, data))
-    if common := found & trained:
-        if given is None or common != found:
+    trained, measured = (set(_episodes(part)) for part in (task.data, data))
+    if common := measured & trained:
+        if validation is None or common != measured:
             raise ValueError(
-                f"{called} has {len(common)} of {len(found)} demonstrations in common with the training "
+                f"{called} has {len(common)} of {len(measured)} demonstrations in common with the training "
                 f"data, {facts['file']}: choose masks, or a --validation, without them"
             )
         words = TRAINED_ON
@@ -154,7 +157,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
 
 
 def _episodes(data: TensorDictBase) -> list[str]:
-    """A digest of the observations of every demonstration."""
+    """Return a digest of the observations of every demonstration."""
     observation = data[OBSERVATION]
     vector = observation[STATE] if isinstance(observation, TensorDictBase) else observation
     lengths = [n for n in data[EPISODE].flatten().bincount().tolist() if n]
@@ -170,29 +173,30 @@ def straightness(
     seed: int = 0,
     **options: Any,
 ) -> list[dict[str, Any]]:
-    """Curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
+    """Return curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
 
-    Every policy is measured at the history of its training and, if it depends on that, at the one that
-    deployment meets, made from its own prediction one decision earlier. A row per policy, training seed and
-    mean, and one with `seed` None for the average over several seeds. Options are those of `curvature`.
+    Every policy is measured with the history of its training. If it depends on the history, it is also
+    measured with the history of deployment, made from its own prediction one decision earlier. There is a row
+    per policy, training seed and history (`mean`), and one with `seed` None for the average over several
+    seeds. Options are those of `curvature`.
     """
     policies = {method: actors for method, actors in policies.items() if method.is_flow}
     if not policies:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     seeds = sorted(next(iter(policies.values())))
-    # By method and mean, of each seed: curvatures, and bounds of the branching cost.
+    # By method and history, per seed: curvatures, and bounds of the branching cost.
     measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}
     jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
     for method, actor in tqdm(jobs, desc="curvature", disable=None):
         windows = observations.windows(actor.prior, see_history=actor.sees_history)
         device = device_of(actor, windows)
-        # Of the earlier prediction: at deployment its noise and that of the next are independent.
+        # For the earlier prediction, whose noise is independent of the next at deployment.
         earlier = torch.Generator(device).manual_seed(seed + 1)
         batches = {"training": encoded_windows(actor, windows)}
         if depends_on_history(actor, batches["training"]):
             batches["deployed"] = observations.deployed(actor, generator=earlier)
         for mean, batch in batches.items():
-            # The same source noise for every policy and mean.
+            # The same source noise for every policy and history.
             generator = torch.Generator(device).manual_seed(seed)
             try:
                 values = curvature(actor, batch, draws=draws, generator=generator, **options).cpu()
@@ -202,11 +206,11 @@ def straightness(
             measured.setdefault((method, mean), []).append((values, limits))
     first = [values for values, _ in measured[next(iter(policies)), "training"]]
     rows = []
-    for (method, mean), found in measured.items():
-        parts: list[Any] = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
+    for (method, mean), by_seed in measured.items():
+        parts: list[Any] = [(s, *pair, base) for s, pair, base in zip(seeds, by_seed, first, strict=True)]
         if len(seeds) > 1:
-            every = zip(*found, strict=True)
-            # NaN where any predicts no motion: the others alone would be no average over the seeds.
+            every = zip(*by_seed, strict=True)
+            # NaN where any seed predicts no motion, because the others alone are no mean over the seeds.
             averages = (torch.stack(list(one)).mean(0) for one in (*every, first))
             parts.append((None, *averages))
         for s, values, limits, baseline in parts:
@@ -226,9 +230,9 @@ def straightness(
 
 
 def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int) -> dict[str, float]:
-    """The ratios to the baseline, with their 95% intervals."""
-    found: dict[str, float] = {}
-    # A field that predicts no motion has no error of one step either, and no merit in that.
+    """Return the ratios to the first policy, with their 95% intervals."""
+    result: dict[str, float] = {}
+    # A field that predicts no motion has no one-step error either, so it is left out.
     still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
     for name, key in RATIOS.items():
         generator = torch.Generator().manual_seed(seed)
@@ -236,5 +240,5 @@ def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int
         if name == "ratio_one_step":
             counted = counted.masked_fill(still, math.nan)
         ends = bootstrap_ratio(counted, baseline[key], episodes, generator=generator)
-        found |= zip((name, f"{name}_low", f"{name}_high"), ends, strict=True)
-    return found
+        result |= zip((name, f"{name}_low", f"{name}_high"), ends, strict=True)
+    return result

@@ -1,7 +1,7 @@
-"""What the benchmarks compare: sources, and what other papers combine with a source, by name.
+"""The methods that the benchmarks compare by name: sources, and methods of other papers.
 
-`past,correlation=0.5`, `ot`, `regression`, ...: the table below composes them of the library's parts.
-A source of your own is a class with one method, `--prior gaussian my_module:Damped` with `my_module.py`:
+The table below composes them (`past,correlation=0.5`, `ot`, `regression`, ...) from the library's parts. A
+source of your own is a class with one method, as in `--prior gaussian my_module:Damped` with `my_module.py`:
 
     class Damped(warmprior.PastPrior):
         name = "damped"
@@ -39,7 +39,7 @@ from warmprior.training import TrainingConfig
 
 
 class ColdPrior(GaussianPrior):
-    """N(0, I) for a policy that predicts `chunks` chunks per executed one."""
+    """N(0, I) for a policy that predicts `chunks` chunks per executed chunk."""
 
     name = "cold"
 
@@ -58,16 +58,16 @@ class TwoChunkPrior(ColdPrior):
 
 
 class WarmStart(StartPoint):
-    r"""A warm start without training: the flow of N(0, I) is entered on the way, from the last forecast.
+    r"""A warm start without training: the flow of N(0, I) is entered at a later time, from the last forecast.
 
     .. math:: a_s = (1 - s) \varepsilon + s f,
 
-    where :math:`f` is what the policy forecast last, as it is known, and held at its last action after that
-    (One-Step Flow Policy, Li et al., 2026, arXiv:2603.12480). An episode begins with a forecast of 0.
+    where :math:`f` is the policy's last forecast, extended by its last action (One-Step Flow Policy, Li et
+    al., 2026, arXiv:2603.12480). At the start of an episode the forecast is 0.
     """
 
     name = "warm-start"
-    sees_history = False  # in training, where it has no part
+    sees_history = False  # training does not use it
 
     def __init__(self, chunk_length: int, start_time: float = 0.5) -> None:
         super().__init__()
@@ -81,15 +81,15 @@ class WarmStart(StartPoint):
     def centre(self, history: Any, observation: Any) -> torch.Tensor:
         forecast, steps = history["forecast"], history["forecast_steps"]
         position = torch.arange(forecast.shape[-2], device=steps.device)
-        known = torch.minimum(position, (steps - 1).clamp_min(0)).unsqueeze(-1)
-        return self.time * forecast.gather(-2, known.expand_as(forecast))
+        index = torch.minimum(position, (steps - 1).clamp_min(0)).unsqueeze(-1)
+        return self.time * forecast.gather(-2, index.expand_as(forecast))
 
     def forward(self, noise: torch.Tensor, history: Any, observation: Any) -> torch.Tensor:
         return self.centre(history, observation) + self.noise_share * noise
 
 
 class PointPrior(GaussianPrior):
-    """The source of a regression: the point 0, and nothing is drawn."""
+    """The source of a regression: the point 0, without randomness."""
 
     name = "point"
 
@@ -104,12 +104,12 @@ class PointPrior(GaussianPrior):
 
 
 def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
-    """Pairs of a source sample and what the teacher's flow makes of it."""
+    """Return the coupling of source samples with the actions that the teacher's flow maps them to."""
     return ReflowCoupling(teacher, teacher_nfe)
 
 
 def bridge(noise: float = 0.5, observation_weight: float = 10.0) -> BridgeCoupling:
-    """Pairs of a Schroedinger bridge; its noise is not the sigma of a source."""
+    """Return the coupling of a Schroedinger bridge; its noise is not the sigma of a source."""
     return BridgeCoupling(noise, observation_weight)
 
 
@@ -117,14 +117,14 @@ def bridge(noise: float = 0.5, observation_weight: float = 10.0) -> BridgeCoupli
 class Composition:
     """The parts of a method."""
 
-    label: str  # in tables and figures
+    label: str  # name in tables and figures
     color: str
     prior: type[Prior] = GaussianPrior
-    start: type | None = None  # where samplers start, if not at the source
-    coupling: Callable[..., Coupling] | None = None  # of sources and targets, if not as they come
-    teacher: str | None = None  # the method whose policy the coupling needs
-    sees_history: bool = False  # the network sees the last actions
-    played: Mapping[str, Any] = field(default_factory=dict)  # options of `Sampling`, where it is no flow
+    start: type | None = None  # start point of samplers; the source sample by default
+    coupling: Callable[..., Coupling] | None = None  # coupling of source and targets; independent by default
+    teacher: str | None = None  # method whose policy the coupling needs
+    sees_history: bool = False  # true if the network sees the last actions
+    played: Mapping[str, Any] = field(default_factory=dict)  # fixed options of `Sampling`, if it is no flow
 
 
 TWO_STEPS = {"nfe": 2, "grid": f"dense-jump:{SECOND}", "temperature": 0.0}
@@ -154,28 +154,28 @@ OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", 
 
 
 def composition(name: str) -> Composition:
-    """The parts behind a name: of the table, or those of a user's own prior."""
+    """Return the parts of a method: from the table, or of a user's own prior."""
     if name in METHODS:
         return METHODS[name]
-    found = find(Prior, name)
-    if found.__module__.partition(".")[0] in ("warmprior", "lab"):
+    prior = find(Prior, name)
+    if prior.__module__.partition(".")[0] in ("warmprior", "lab"):
         raise ValueError(f"{name} is a part of methods, and none itself")
-    if found.mean is Prior.mean and found.distribution is Prior.distribution:
+    if prior.mean is Prior.mean and prior.distribution is Prior.distribution:
         raise ValueError(f"{name} has neither a mean nor a distribution of its own")
-    if found.name in METHODS:
+    if prior.name in METHODS:
         raise ValueError(
-            f"{name} has the name of the method {found.name!r}: set another class attribute name"
+            f"{name} has the name of the method {prior.name!r}: set another class attribute name"
         )
-    return Composition(found.name, color(found.name), found)
+    return Composition(prior.name, color(prior.name), prior)
 
 
 def label(name: str, options: str = "") -> str:
-    """What tables and figures call a method: `WP-Past, correlation=0.5`."""
+    """Return the name of a method in tables and figures, such as `WP-Past, correlation=0.5`."""
     return ", ".join(filter(None, (METHODS[name].label if name in METHODS else name, options)))
 
 
 def color(name: str) -> str:
-    """Its colour in figures; a user's own prior has one that depends on its name alone."""
+    """Return the colour of a method in figures; a user's own prior gets one by its name."""
     if name in METHODS:
         return METHODS[name].color
     return OWN_COLORS[zlib.crc32(name.encode()) % len(OWN_COLORS)]
@@ -183,14 +183,14 @@ def color(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One method of a comparison: its name with options, as typed, the chunk length H and the residual noise.
+    """A method of a comparison: its name and options as typed, the chunk length H and the residual noise.
 
-    Methods are equal if they do the same: options at their defaults are left out.
+    Methods are equal if they do the same, so options at their defaults do not count.
     """
 
     text: str  # `past,correlation=0.5`, or package.module:Class of a prior of your own
     chunk_length: int
-    sigma_asked: float | None = None  # ignored where the method takes none
+    sigma_asked: float | None = None  # ignored if the method takes none
     parts: Composition = field(init=False, repr=False)
     arguments: dict[str, Any] = field(init=False, repr=False)
 
@@ -202,19 +202,19 @@ class Method:
             names = ", ".join(METHODS)
             raise ValueError(f"--prior {self.text}: {error}; methods: {names}") from error
         object.__setattr__(self, "parts", parts)
-        known: dict[str, Any] = {}
+        defaults: dict[str, Any] = {}
         for part in filter(None, (parts.prior, parts.start, parts.coupling)):
-            known |= _parameters(part)
-        known |= {"sigma": parts.prior.default_sigma} if "sigma" in known else {}
-        given = options_of(self.text)
-        if self.sigma_asked is not None and "sigma" in known:
-            if "sigma" in given:
+            defaults |= _parameters(part)
+        defaults |= {"sigma": parts.prior.default_sigma} if "sigma" in defaults else {}
+        typed_options = options_of(self.text)
+        if self.sigma_asked is not None and "sigma" in defaults:
+            if "sigma" in typed_options:
                 raise ValueError(f"--prior {self.text} and --sigma {self.sigma_asked:g} both set sigma")
-            given["sigma"] = float(self.sigma_asked)
-        own = {k: v for k, v in sorted(given.items()) if v is not None and v != known.get(k)}
-        object.__setattr__(self, "arguments", own)
+            typed_options["sigma"] = float(self.sigma_asked)
+        changed = {k: v for k, v in sorted(typed_options.items()) if v is not None and v != defaults.get(k)}
+        object.__setattr__(self, "arguments", changed)
         try:
-            if unknown := given.keys() - known.keys():
+            if unknown := typed_options.keys() - defaults.keys():
                 raise ValueError(f"{', '.join(sorted(unknown))} is unknown to it, or without effect")
             self.prior(), self.start()
             if self.pairs_in_batch:
@@ -222,11 +222,11 @@ class Method:
         except (TypeError, ValueError, ArithmeticError) as error:
             raise ValueError(
                 f"--prior {self.text} with H = {self.chunk_length}: {error}; its options are "
-                f"{', '.join(known) or 'none'}"
+                f"{', '.join(defaults) or 'none'}"
             ) from error
 
     def __reduce__(self) -> Any:
-        # A fresh process imports a prior of the user's own again, by what the user typed.
+        # A worker process imports a user's own prior again, by its typed name.
         return Method, (self.text, self.chunk_length, self.sigma_asked)
 
     def __eq__(self, other: object) -> bool:
@@ -240,28 +240,28 @@ class Method:
         return ", ".join(filter(None, parts))
 
     def config(self) -> dict[str, Any]:
-        """Everything that makes it differ from others, as JSON."""
+        """Return everything that makes it differ from other methods, as JSON."""
         config = {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
         if self.text.partition(",")[0] not in METHODS:
-            # Whoever edits a prior of their own wants it trained anew.
+            # A policy is trained again when a user edits their own prior.
             file = inspect.getfile(self.parts.prior)
             config["code"] = digest_of(Path(file).read_text(encoding="utf-8"))
         return config
 
     @property
     def facts(self) -> dict[str, Any]:
-        known = {"prior": self.name, "options": self.options, "sigma": self.sigma}
-        return {**known, "chunk": self.chunk_length}
+        facts = {"prior": self.name, "options": self.options, "sigma": self.sigma}
+        return {**facts, "chunk": self.chunk_length}
 
     @property
     def name(self) -> str:
-        """A key of the table, or the name of a user's own prior."""
+        """Return a key of the table, or the name of a user's own prior."""
         typed = self.text.partition(",")[0]
         return typed if typed in METHODS else self.parts.prior.name
 
     @property
     def options(self) -> str:
-        """Its other options that are not at their defaults, as they are typed."""
+        """Return its options that differ from their defaults, except sigma, as they are typed."""
         return ",".join(f"{k}={json.dumps(v)}" for k, v in self.arguments.items() if k != "sigma")
 
     @cached_property
@@ -274,39 +274,39 @@ class Method:
 
     @property
     def is_flow(self) -> bool:
-        """It is a flow if the field is trained at all times: any number of steps then integrates it."""
+        """Return True if the field is trained at all times, so that any number of steps integrates it."""
         return not self.parts.played
 
     @property
     def is_regression(self) -> bool:
-        """A regression is trained at ``t = 0`` alone."""
+        """Return True if it is trained at ``t = 0`` alone."""
         return self.parts.prior is PointPrior
 
     @property
     def is_straight(self) -> bool:
-        """Whether its path is the straight line, on which a velocity predicts the sample."""
+        """Return True if its path is a straight line, on which a velocity predicts the sample."""
         return self.parts.coupling is not bridge
 
     @property
     def pairs_in_batch(self) -> bool:
-        """Whether the windows of a batch are paired, so that it needs two of them."""
+        """Return True if it pairs the windows of a batch, and so needs two of them."""
         return self.parts.coupling in (OTCoupling, bridge)
 
     @property
     def needs_vector(self) -> bool:
-        """Whether it reads the observation as one tensor, so that it cannot go with images."""
+        """Return True if it reads the observation as one tensor, and so does not work with images."""
         parts = self.parts.prior, self.parts.start
-        seen = any(getattr(part, "sees_observation", False) for part in parts)
-        return seen or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
+        reads = any(getattr(part, "sees_observation", False) for part in parts)
+        return reads or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
 
     @cached_property
     def has_anchor(self) -> bool:
-        """Whether agents search around a centre that moves."""
+        """Return True if agents search around a centre that moves."""
         return has_anchor(SimpleNamespace(prior=self.prior(), start=self.start(), network=None))
 
     @property
     def remembers(self) -> bool:
-        """Whether its chunks depend on what was done before."""
+        """Return True if its chunks depend on the history."""
         part = self.parts.start or self.parts.prior
         return self.parts.sees_history or (self.has_anchor and getattr(part, "sees_history", True))
 
@@ -315,34 +315,35 @@ class Method:
         name = self.parts.teacher
         return None if name is None else Method(name, self.chunk_length)
 
-    def nfes(self, asked: Sequence[int]) -> list[int]:
-        """Return with how many network evaluations it is played, the largest first; its own if no flow."""
-        return sorted(set(asked), reverse=True) if self.is_flow else [self.parts.played["nfe"]]
+    def nfes(self, nfes: Sequence[int]) -> list[int]:
+        """Return the NFEs that it is played with, the largest first; a method without a flow has its own."""
+        return sorted(set(nfes), reverse=True) if self.is_flow else [self.parts.played["nfe"]]
 
-    def temperatures(self, asked: Sequence[float]) -> Sequence[float]:
-        """The factors of the source's noise that it is played with."""
-        return [self.parts.played["temperature"]] if "temperature" in self.parts.played else asked
+    def temperatures(self, temperatures: Sequence[float]) -> Sequence[float]:
+        """Return the temperatures that it is played with; some methods have their own."""
+        played = self.parts.played
+        return [played["temperature"]] if "temperature" in played else temperatures
 
     def recipe(self, training: TrainingConfig) -> TrainingConfig:
-        """The recipe of this method: no history is withheld in vain; what is no flow has its own times."""
-        times = "start" if self.is_regression else "uniform"  # which a coupling's own replace
-        own: dict[str, Any] = {} if self.is_flow else {"times": times}
-        return replace(training, **own | ({} if self.remembers else {"cold_probability": 0.0}))
+        """Return the recipe with this method's times, and without withholding a history that it ignores."""
+        times = "start" if self.is_regression else "uniform"  # a coupling may replace these
+        changes: dict[str, Any] = {} if self.is_flow else {"times": times}
+        return replace(training, **changes | ({} if self.remembers else {"cold_probability": 0.0}))
 
     def prior(self, widths: Sequence[int] = ()) -> Prior:
-        """A fresh source; one that learns is given the widths d_a, d_o and To."""
+        """Make a source; a learned one gets the widths d_a, d_o and To."""
         return self._make(self.parts.prior, widths)
 
     def start(self, widths: Sequence[int] = ()) -> Any:
         return None if self.parts.start is None else self._make(self.parts.start, widths)
 
     def coupling(self, teacher: WarmPriorActor | None = None) -> Coupling | None:
-        """How sources and targets are paired, if not as they come."""
+        """Make the coupling of source and targets; None if they are independent."""
         make = self.parts.coupling
         return None if make is None else make(*([teacher] if teacher else []), **self._own(make))
 
     def _own(self, make: Any) -> dict[str, Any]:
-        """Those of its options that a part takes."""
+        """Return the options that a part takes."""
         return {k: v for k, v in self.arguments.items() if k in _parameters(make)}
 
     def _make(self, kind: Any, widths: Sequence[int]) -> Any:
@@ -352,7 +353,7 @@ class Method:
 
 
 def _parameters(part: Any) -> dict[str, Any]:
-    """Options of a constructor or function, with their defaults; the rest follows from the method."""
+    """Return the options of a constructor or function with defaults, except those that the method sets."""
     return {
         p.name: p.default
         for p in inspect.signature(part).parameters.values()

@@ -1,4 +1,4 @@
-"""MIP: two supervised steps, from the point 0 or a source and from nearly the action, in a flow's parts."""
+"""MIP: two supervised steps, from the point 0 or a source, and from near the action, as parts of a flow."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from warmprior import LinearInterpolant
 
 SECOND = 0.9
-"""Time of the second step."""
+"""Flow time of the second step."""
 
 
 class MIPInterpolant(LinearInterpolant):
-    """The straight line, but for ``t = 0``, where the point is 0 and not a draw of the source.
+    """The straight line, except at ``t = 0``, where the point is 0 instead of a source sample.
 
     Examples:
         >>> import torch
@@ -29,28 +29,28 @@ class MIPInterpolant(LinearInterpolant):
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Point on the path and its velocity."""
+        """Return the point on the path and its velocity."""
         return super().__call__(torch.where(t[..., None, None] > 0, a0, 0.0), a1, t)
 
 
 class TwoStepCoupling:
-    r"""Pairs as they come, at two times: :math:`t = 0`, at a draw of the source, and :math:`t = 0.9`.
+    r"""Independent pairs, at two times: :math:`t = 0`, at a source sample, and :math:`t = 0.9`.
 
     With :math:`f = a_t + (1 - t) v` the network predicts the action from both points. The policy is Euler's
-    method from 0 to 0.9 to 1. If the network is preconditioned, both errors count in units of what a linear
-    prediction leaves.
+    method from 0 to 0.9 to 1. If the network is preconditioned, both errors are divided by the standard
+    deviation that preconditioning leaves.
     """
 
     name = "two-steps"
 
     def config(self) -> dict[str, Any]:
-        """Return its name: it has no options."""
+        """Return its name; it has no options."""
         return {"name": self.name}
 
     def times(
         self, shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
     ) -> Tensor:
-        """Draw the two times alike often."""
+        """Draw the two times with equal probability."""
         second = torch.rand(shape, generator=generator, dtype=dtype, device=device) < 0.5
         return torch.where(second, SECOND, 0.0).to(dtype)
 

@@ -1,4 +1,4 @@
-"""How policies behave on the one-dimensional navigation toy (the paper's Fig. 5)."""
+"""Rollouts and measures of policies on the one-dimensional navigation toy (the paper's Fig. 5)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms import policy_transforms
 
 SHIFT = 0.15
-"""Standard deviation of the history shift, a third of the gap between the sides at its narrowest."""
+"""Standard deviation of the history shift, a third of the narrowest gap between the sides."""
 
 
 def play_navigation(
@@ -35,13 +35,13 @@ def play_navigation(
 
     Args:
         actor: the policy.
-        seed: of the source samples and the history shift.
+        seed: seed of the source samples and of the history shift.
 
     Keyword Args:
         nfe: network evaluations per chunk.
-        rollouts: how many.
+        rollouts: number of rollouts.
         shift: standard deviation of the noise on the remembered mean.
-        make_env: makes the toy as the policy sees it: that of its :class:`Task`.
+        make_env: makes the toy with the policy's observations, as its :class:`Task` does.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -67,11 +67,11 @@ def judge_navigation(
     rollouts: int = 256,
     make_env: Callable[..., EnvBase] = NavigationEnv,
 ) -> dict[str, Any]:
-    """Play a policy on the toy (:func:`play_navigation`) and measure what it did.
+    """Play a policy on the toy (:func:`play_navigation`), and return its measures.
 
-    Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
+    They are metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
     (:class:`~warmprior.diagnostics.Smoothness`), and some metrics under history shift (``"shifted_..."``). A
-    policy whose actions become NaN or infinite collides, and has no other metrics.
+    policy whose actions become NaN or infinite counts as colliding, and its other metrics are NaN.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -99,7 +99,7 @@ def judge_navigation(
 
 
 def _diverged(rollout: TensorDictBase) -> bool:
-    """Whether an executed action is NaN or infinite."""
+    """Return True if an executed action is NaN or infinite."""
     chunk = rollout[keys.CHUNK]
     executed = torch.arange(chunk.shape[-2]) < rollout["next", keys.EXECUTED]
     return not bool(torch.isfinite(chunk[executed]).all())

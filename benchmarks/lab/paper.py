@@ -1,4 +1,4 @@
-"""What the paper reports, to stand beside measured numbers and never to be mixed in."""
+"""The paper's numbers, which reports show next to measured ones."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ STATE, IMAGE = "state", "image"
 
 
 def _row(*values: float) -> dict[str, dict[int, float]]:
-    """A line of Table 1: of each NFE the base, WP-Past and WP-Preview."""
+    """Return a line of Table 1, which has Gaussian source, WP-Past and WP-Preview for each NFE."""
     return {
         prior: {nfe: values[3 * column + place] for column, nfe in enumerate((9, 3, 1))}
         for place, prior in enumerate(("gaussian", "past", "preview"))
     }
 
 
-#: Table 1, H = 8, percent: (task, data, what policies see) -> prior -> NFE -> success rate.
+#: Table 1, H = 8, percent: (task, data, observations) -> prior -> NFE -> success rate.
 PAPER_SUCCESS: dict[tuple[str, str, str], dict[str, dict[int, float]]] = {
     ("square", "ph", STATE): _row(86.7, 88.1, 88.1, 86.2, 88.0, 87.9, 83.6, 86.6, 87.3),
     ("square", "mh", STATE): _row(65.9, 69.2, 72.7, 65.4, 73.2, 72.9, 65.9, 70.1, 77.8),
@@ -43,18 +43,18 @@ PAPER_CURVATURE: dict[tuple[str, str], dict[str, float]] = {
     ("tool_hang", "ph"): {"past": 0.806, "preview": 0.807},
 }
 
-#: Appendix on sigma, square mh, H = 8, NFE 1: prior -> sigma -> success rate, where a number is given.
+#: Appendix on sigma, square mh, H = 8, NFE 1: prior -> sigma -> success rate, where the text has a number.
 PAPER_SIGMA: dict[str, dict[float, float]] = {
     "past": {0.5: 0.701, 0.0: 0.05},
     "preview": {1.0: 0.778, 0.0: 0.31},
 }
 
-#: What the tables are for: the number of executed actions, and the noise of the sources.
+#: The number of executed actions, and the noise of the sources, in the paper's tables.
 PAPER_CHUNK, PAPER_DEFAULT_SIGMA = 8, {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
 
 
 def _setting(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
-    """Task, data and what policies see in a row, or None if it was played or trained unlike the paper's."""
+    """Return task, data and observations of a row; None if it was trained or played unlike the paper's."""
     texts = {name: value for name, value in row.items() if isinstance(value, str)}  # others are NaN
     if row["chunk"] != PAPER_CHUNK or "delay" in row or row.get("temperature", 1.0) != 1.0:
         return None
@@ -64,7 +64,7 @@ def _setting(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
 
 
 def paper_success(row: Mapping[str, Any]) -> float:
-    """The paper's success rate, a share of 1, for the same experiment as a row's; NaN where it has none.
+    """Return the paper's success rate, between 0 and 1, for the experiment of a row; NaN if it has none.
 
     >>> row = {"task": "square", "data": "mh", "prior": "preview", "sigma": 1.0, "nfe": 1, "chunk": 8}
     >>> [round(paper_success(row | more), 3) for more in ({}, {"obs": "image"}, {"sigma": 0.0})]
@@ -79,13 +79,13 @@ def paper_success(row: Mapping[str, Any]) -> float:
 
 
 def paper_curvature(row: Mapping[str, Any]) -> float:
-    """The paper's curvature relative to the Gaussian source's, likewise.
+    """Return the paper's curvature over the Gaussian source's for the experiment of a row; NaN if not given.
 
     >>> row = {"task": "square", "data": "mh", "prior": "past", "sigma": 0.5, "chunk": 8}
     >>> paper_curvature(row), paper_curvature(row | {"options": "correlation=0.5"})
     (0.705, nan)
     """
-    task, data, seen = _setting(row) or ("", "", "")
-    if seen != STATE or row["sigma"] != PAPER_DEFAULT_SIGMA.get(row["prior"]):
+    task, data, observations = _setting(row) or ("", "", "")
+    if observations != STATE or row["sigma"] != PAPER_DEFAULT_SIGMA.get(row["prior"]):
         return math.nan
     return PAPER_CURVATURE.get((task, data), {}).get(row["prior"], math.nan)

@@ -1,4 +1,4 @@
-"""How results are drawn: bars, lines, violins and paths, from the same rows as the tables."""
+"""The figures of the benchmarks: bars, lines, violins and paths, from the same rows as the tables."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from warmprior.envs.navigation1d import (
     navigation_positions,
 )
 
-ABOVE, BELOW, INK = "#1f77b4", "#d95f02", "#202020"  # sides of the toy's obstacles, and one path
-PALEST = 0.6  # share of white (or black, where the prior's own colour is bright) in the last shade
+ABOVE, BELOW, INK = "#1f77b4", "#d95f02", "#202020"  # sides of the toy's obstacles, and a highlighted path
+PALEST = 0.6  # share of white (or black, for bright colours) in a method's last shade
 RATES = ("success", "success_rate")
 
 
-# What the pictures share
+# Parts of all figures
 
 
 def new_figure(
     width: float, height: float, rows: int = 1, columns: int = 1, share: bool = False
 ) -> tuple[Figure, list[Any]]:
-    """A figure and its axes, row by row; it needs no display and leaves no pyplot state behind."""
+    """Return a figure and its axes, row by row; it needs no display and leaves no pyplot state."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share)
     return figure, list(axes.flat)
 
 
 def save(figure: Figure, path: str | Path, title: str, size: int = 10) -> None:
-    """Write a figure with its title, and with one legend of all axes below, by which the picture grows."""
+    """Write a figure with its title, and one legend of all axes below it, which enlarges the picture."""
     handles = {
         label: handle
         for axis in figure.axes
@@ -58,7 +58,7 @@ def save(figure: Figure, path: str | Path, title: str, size: int = 10) -> None:
 
 
 def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = False) -> None:
-    """Title, labels, grid and, for a share of episodes, limits of an axis."""
+    """Set title, labels and grid of an axis, and the limits of a rate."""
     axis.set_title(title, fontsize=10)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
@@ -68,49 +68,49 @@ def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = Fal
 
 
 def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
-    """The colour of each method: its prior's, in shades where several methods share a prior."""
+    """Return the colour of each method: its prior's, in shades if several methods share a prior."""
     colors: dict[Hashable, Any] = {}
     for prior, group in rows.groupby("prior", sort=False):
-        own, methods = to_rgb(color(prior)), group["method"].unique()
-        end = float(sum(own) < 2)
+        base, methods = to_rgb(color(prior)), group["method"].unique()
+        end = float(sum(base) < 2)
         for place, method in enumerate(methods):
             share = PALEST * place / max(1, len(methods) - 1)
-            colors[method] = tuple((1 - share) * part + share * end for part in own)
+            colors[method] = tuple((1 - share) * part + share * end for part in base)
     return colors
 
 
 def side_by_side(
     axis: Any, rows: DataFrame, group: str, colors: Mapping[Hashable, Any]
 ) -> Iterator[tuple[float, DataFrame, dict[str, Any]]]:
-    """The methods of each group beside each other: where to draw which rows, and how.
+    """Yield position, rows and style of every method, side by side in each group.
 
-    The legend names each method once.
+    Only the first style of a method has a label, so that the legend names it once.
     """
     methods, groups = list(colors), list(rows[group].unique())
     step, named = len(methods) + 0.8, set()
     for g, (_, members) in enumerate(rows.groupby(group, sort=False)):
-        for method, cell in members.groupby("method", sort=False):
+        for method, rows_of_method in members.groupby("method", sort=False):
             name = None if method in named else method
-            yield g * step + methods.index(method), cell, {"color": colors[method], "label": name}
+            yield g * step + methods.index(method), rows_of_method, {"color": colors[method], "label": name}
             named.add(method)
     axis.set_xticks([g * step + (len(methods) - 1) / 2 for g in range(len(groups))], groups)
 
 
-# Comparisons of methods: rows have their `method` in words
+# Comparisons of methods: rows have the column `method`
 
 
 def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nfe") -> None:
-    """Posteriors of the success rate as violins (appendix A); a method's rows of a group are pooled.
+    """Draw posteriors of the success rate as violins (appendix A); rows of a method and group are pooled.
 
-    The width at height p is the density Beta(k + 1, n - k + 1), the tick its mean; k/n stands below.
+    The width at height p is the density Beta(k + 1, n - k + 1), and the tick is its mean. k/n is below.
     """
     names = rows[group].map(lambda value: value if isinstance(value, str) else f"{group.upper()} {value}")
     rows = rows.assign(group=names)
     width = 2.2 + 0.55 * (rows["method"].nunique() + 1) * rows[group].nunique()
     figure, (axis,) = new_figure(width, 4.2)
     grid = np.linspace(0.0, 1.0, 801)
-    for x, cell, look in side_by_side(axis, rows, "group", colors_of(rows)):
-        k, n = float(cell["successes"].sum()), int(cell["episodes"].sum())
+    for x, violin, look in side_by_side(axis, rows, "group", colors_of(rows)):
+        k, n = float(violin["successes"].sum()), int(violin["episodes"].sum())
         posterior = success_posterior(k, n)
         density = posterior.pdf(grid)
         half = 0.42 * density / density.max()
@@ -130,10 +130,9 @@ def plot_bars(
     measures: Mapping[str, str],
     column: str = "setting",
 ) -> None:
-    """Means over seeds as bars with their deviation: a line of panels per measure, a panel per `column`.
+    """Draw means over seeds as bars with their deviation: a line of panels per measure, a panel per `column`.
 
-    Methods stand beside each other in groups; `measures` maps columns of the rows to what is written
-    beside the axis.
+    Methods are side by side in groups. `measures` maps columns of the rows to labels of axes.
     """
     panels, colors = rows[column].unique(), colors_of(rows)
     width = 1.0 + rows[group].nunique() * (0.6 + 0.33 * rows["method"].nunique())
@@ -141,9 +140,9 @@ def plot_bars(
     places = [(name, panel) for name in measures for panel in panels]
     for axis, (name, panel) in zip(axes, places, strict=True):
         rate = name in RATES
-        known = rows[(rows[column] == panel) & rows[name].notna()]
-        for x, cell, look in side_by_side(axis, known, group, colors):
-            mean, std = cell[name].mean(), cell[name].std()
+        panel_rows = rows[(rows[column] == panel) & rows[name].notna()]
+        for x, bar, look in side_by_side(axis, panel_rows, group, colors):
+            mean, std = bar[name].mean(), bar[name].std()
             shown = f"{100 * mean:.0f}" if rate else f"{mean:.2f}"
             axis.bar(x, mean, 0.85, yerr=None if math.isnan(std) else std, capsize=3, **look)
             above = mean + (0.0 if math.isnan(std) else std)  # the error bar
@@ -165,10 +164,10 @@ def plot_lines(
     column: str = "nfe",
     scale: str = "even",
 ) -> None:
-    """Means over seeds against `x`, their deviation shaded: panels in a line per measure, one per `column`.
+    """Draw means over seeds against `x`, with shaded deviations, in a panel per measure and `column`.
 
-    Of a pair of measures the second is dotted. The values of `x` stand evenly, in the order of the rows, or
-    on the `log` or `linear` scale.
+    The second of a pair of measures is dotted. On the scale `even` the values of `x` have equal distances, in
+    the order of the rows; other scales are `log` and `linear`.
     """
     panels, values, colors = rows[column].unique(), list(rows[x].unique()), colors_of(rows)
     figure, axes = new_figure(3.6 * len(panels), 0.4 + 2.8 * len(measures), len(measures), len(panels))
@@ -200,7 +199,7 @@ def plot_lines(
 def plot_learning_curves(
     losses: Mapping[str, Sequence[Sequence[tuple[int, float]]]], rows: DataFrame, path: str | Path, title: str
 ) -> None:
-    """Loss and success against the iteration; `losses` by method, a list of (iteration, loss) per seed."""
+    """Draw loss and success against iterations; `losses` has (iteration, loss) per method and seed."""
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
     colors = colors_of(rows)
     for method, seeds in losses.items():
@@ -219,7 +218,7 @@ def plot_learning_curves(
 
 
 def plot_filmstrip(frames: Sequence[np.ndarray], labels: Sequence[str], path: str | Path, title: str) -> None:
-    """One episode as a row of pictures, uint8 [h, w, 3], with a text below each."""
+    """Draw an episode as a row of pictures, uint8 [h, w, 3], with a label below each."""
     figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
     for axis, frame, label in zip(axes, frames, labels, strict=True):
         axis.imshow(frame)
@@ -232,7 +231,7 @@ def plot_filmstrip(frames: Sequence[np.ndarray], labels: Sequence[str], path: st
 
 
 def sides(axis: Any, x: np.ndarray, lines: np.ndarray, decides: int, **look: Any) -> None:
-    """Lines in the colour of the side on which one of their points lies."""
+    """Draw lines in the colour of the side of their point with index `decides`."""
     for line in lines:
         axis.plot(x, line, color=ABOVE if line[decides] > 0 else BELOW, **look)
 
@@ -243,10 +242,10 @@ def plot_navigation(
     chunk_length: int,
     title: str,
 ) -> None:
-    """Executed paths between the obstacles, a panel per policy after one of the data (Fig. 5).
+    """Draw executed paths between the obstacles, in a panel for the data and one per policy (Fig. 5).
 
-    `panels` has by title the heights [n, 64] and lines of text. A path has the colour of the side of its
-    first action; one is black, with a dot at the first action of each chunk.
+    `panels` has heights [n, 64] and lines of text by title. A path is coloured by the side of its first
+    action; one path is black, with a dot at the first action of each chunk.
     """
     rows = -(-(len(panels) + 1) // 3)
     figure, axes = new_figure(11.0, 0.7 + 3.0 * rows, rows, 3, share=True)
@@ -281,7 +280,7 @@ def plot_navigation(
 
 
 def plot_flow_paths(paths: Mapping[str, Tensor], path: str | Path, title: str) -> None:
-    """One action coordinate along the flow, [n, steps + 1], in a panel per policy (Fig. 4)."""
+    """Draw an action coordinate along the flow, [n, steps + 1], in a panel per policy (Fig. 4)."""
     figure, axes = new_figure(2.5 * len(paths) + 0.5, 3.4, 1, len(paths), share=True)
     for axis, (name, lines) in zip(axes, paths.items(), strict=True):
         values = lines.numpy()

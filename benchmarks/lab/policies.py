@@ -1,7 +1,7 @@
 """Policies of a comparison: their folders, the jobs that train and play them, and their rows.
 
-A policy lies in a folder named by a digest of everything that determines it, so runs with the same options
-share it. What is measured of it is a row: one JSON object in `results.jsonl`.
+The name of a policy's folder contains a digest of everything that determines it, so runs with the same
+options share it. A row is one JSON object in `results.jsonl`, with the results of one evaluation.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from warmprior.training import (
 from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
 from warmprior.training.checkpoint import load_state, module_tensors, restore_module, restoring, save_state
 
-LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
+LEARNING_SHARE = 0.25  # gradient steps of a learned source per gradient step of the flow
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy of a comparison, trained or not. A worker process builds all of it from these options."""
+    """A policy of a comparison, trained or not; worker processes build it from these options."""
 
-    place: tuple[str | None, str]  # of the task: what `load_task` takes
+    place: tuple[str | None, str]  # name and style of the task, for `load_task`
     data: DataOptions
     network: NetworkOptions
     method: Method
-    training: TrainingConfig  # with its seed
-    run: Run  # with an absolute folder
+    training: TrainingConfig  # the recipe, seed included
+    run: Run  # the run, with an absolute folder
     grid: str
-    name: str = ""  # of its own folder
-    facts: dict[str, Any] = field(default_factory=dict, compare=False)  # what every row of it says
+    name: str = ""  # name of its folder
+    facts: dict[str, Any] = field(default_factory=dict, compare=False)  # columns of all its rows
 
     @property
     def folder(self) -> Path:
@@ -75,16 +75,16 @@ class Policy:
 
     @property
     def is_trained(self) -> bool:
-        """Whether its last policy of averaged weights is there; the file is whole, or not there."""
+        """Return True if its last policy is saved; files are written atomically."""
         return (policy_path(self.folder, self.training.iterations) / "model.safetensors").is_file()
 
     @property
     def status(self) -> Path:
-        """How far its training is, and the processor time that it took."""
+        """Return the file with the progress and processor time of its training."""
         return self.folder / "status.json"
 
     def task(self) -> Task:
-        """What it is trained for; read once per process."""
+        """Return its task, which is read once per process."""
         return cached_task(self.data, *self.place, self.network.observation_steps)
 
     def teacher(self) -> Policy | None:
@@ -92,9 +92,9 @@ class Policy:
         return None if method is None else policy_of(self.task(), self, method)
 
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
-        """The policy of averaged weights, on the CPU, as it is played here."""
+        """Load the policy of averaged weights on the CPU, with this comparison's environment and grid."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
-        # Runs of another time limit share it.
+        # Runs with another time limit share the file.
         policy = load_policy(path).replace(environment=self.task().environment)
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
 
@@ -104,36 +104,37 @@ class Policy:
 
     @property
     def seconds(self) -> float | None:
-        """Processor time of its training, with its teacher's; None if it is not trained."""
-        teacher, own = self.teacher(), clock(self.status)
-        others = 0.0 if teacher is None else teacher.seconds
-        return None if own is None or others is None else own + others
+        """Return the processor time of its training, including its teacher's; None if it is not trained."""
+        teacher, seconds = self.teacher(), clock(self.status)
+        of_teacher = 0.0 if teacher is None else teacher.seconds
+        return None if seconds is None or of_teacher is None else seconds + of_teacher
 
 
 cached_task = cache(load_task)
 
 
 def facts_of(task: Task) -> dict[str, Any]:
-    """A task's name and style, and what its demonstrations are."""
+    """Return a task's name and style, and the facts of its demonstrations."""
     return {"task": task.name, "data": task.style, **task.facts}
 
 
 def policies_of(options: Options, *more: tuple[str, str], only: bool = False) -> list[Policy]:
-    """One policy per task, recipe, method and seed, the baseline's first; demonstrations are read, or made.
+    """Return a policy per task, recipe, method and seed, the first method's first.
 
-    The tasks are those that the options name and `more`, or with `only` the latter alone.
+    The tasks are those of the options and `more`; with `only` just `more`. Demonstrations are read,
+    downloaded or generated.
     """
     run = replace(options.run, out=options.run.folder.absolute())
-    with leader_first():  # other processes find what it has generated, rendered or downloaded
+    with leader_first():  # other processes find the files of the first
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
         tasks = {place: cached_task(options.data, *place, steps) for place in places}
         names = [(task.name, task.style) for task in tasks.values()]
         if twice := [" ".join(name) for name in set(names) if names.count(name) > 1]:
             raise ValueError(
-                f"--task: two tasks are called {twice[0]}; give one of them another name or style"
+                f"--task: two tasks are called {twice[0]}: give one of them another name or style"
             )
-    found = []
+    policies = []
     for place, task in tasks.items():
         network = options.network if task.images else options.network.without_images()
         for training in options.trainings():
@@ -146,12 +147,12 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
                 for seed in options.seeds:
                     seeded, grid = replace(training, seed=seed), options.evaluation.grid
                     like = Policy(place, options.data, network, method, seeded, run, grid)
-                    found.append(policy_of(task, like, method))
-    return list({policy.folder: policy for policy in found}.values())
+                    policies.append(policy_of(task, like, method))
+    return list({policy.folder: policy for policy in policies}.values())
 
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
-    """The policy of another method on a task, with the options of a policy; names its folder."""
+    """Return the policy of another method on a task, with the options of the policy `like`."""
     digest = digest_of(
         task.identity,
         asdict(like.training),
@@ -177,15 +178,15 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
 
 
 def slug(text: str) -> str:
-    """A text as part of a folder's name; no two texts have the same."""
+    """Return a text as part of a folder's name, different for every text."""
     plain = re.sub(r"[^\w.=+,-]+", "-", text, flags=re.ASCII)[:60]
     return plain if plain == text else f"{plain}-{digest_of(text)[:8]}"
 
 
 def train(policy: Policy) -> None:
-    """Train a policy, or find it trained. Whoever else asks for it waits.
+    """Train a policy that is not trained yet, and its teacher and learned source before.
 
-    What it needs before, a teacher or a source that learns, is trained here as well.
+    Other processes that train the same policy wait.
     """
     policy.folder.mkdir(parents=True, exist_ok=True)
     if (teacher := policy.teacher()) is not None:
@@ -194,7 +195,7 @@ def train(policy: Policy) -> None:
         if from_leader(lambda: policy.is_trained):
             return
         task, method = policy.task(), policy.method
-        # A worker that trains on a GPU sees no other.
+        # A worker sees only its own GPU.
         device = torch.device(policy.run.device).type
         training = method.recipe(policy.training)
         widths = (
@@ -211,7 +212,7 @@ def train(policy: Policy) -> None:
         logger, logs = None, str(policy.run.folder / "logs")
         if policy.run.logger != "none" and not rank():
             logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
-        # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
+        # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss`.
         train_policy(
             task,
             prior,
@@ -231,31 +232,31 @@ def train(policy: Policy) -> None:
         )
         progress(training.iterations)  # the last policy is saved as well
     if torch.cuda.is_initialized():
-        torch.cuda.empty_cache()  # for the next training, which may be another worker's
+        torch.cuda.empty_cache()  # for other workers on the same GPU
 
 
 def clock(status: Path) -> float | None:
-    """The processor time in a status file, if there is one."""
+    """Return the processor time in a status file; None if there is no file."""
     if not status.exists():
         return None
     try:
         return float(read_json(status)["seconds"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{status} is damaged: remove it, and the time before is not counted ({error})"
+            f"{status} is damaged: remove it; the training then counts its time from 0 ({error})"
         ) from error
 
 
 def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
-    """Write how far a training is, once a second, and the processor time, of earlier starts as well."""
+    """Return a function that writes the progress and total processor time of a training once a second."""
     began = time.process_time() - (clock(path) or 0.0)
-    wrote = time.monotonic()
+    last_write = time.monotonic()
 
     def write(iteration: int) -> None:
-        nonlocal wrote
-        if rank() or (time.monotonic() - wrote < 1.0 and iteration < iterations):
+        nonlocal last_write
+        if rank() or (time.monotonic() - last_write < 1.0 and iteration < iterations):
             return
-        wrote = time.monotonic()
+        last_write = time.monotonic()
         seconds = time.process_time() - began
         status = {"iteration": iteration, "iterations": iterations, "seconds": seconds}
         write_atomic(path, lambda path: path.write_text(json.dumps(status)))
@@ -264,7 +265,7 @@ def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
 
 
 def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
-    """Let a source learn, or take what it learnt when the training was begun."""
+    """Train a learned source, or load it if an earlier start of the training did."""
     path = policy.folder / "learner.safetensors"
     if path.exists():
         with restoring(path):
@@ -282,17 +283,17 @@ def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
 
 
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
-    """The last policies by method and seed; a method of which a seed failed would not compare."""
+    """Return the last policies by method and seed, without methods of which a seed failed."""
     seeds = {policy.training.seed for policy in policies}
-    found: dict[Method, dict[int, WarmPriorActor]] = {}
+    by_method: dict[Method, dict[int, WarmPriorActor]] = {}
     for policy in policies:
         if policy.is_trained:
-            found.setdefault(policy.method, {})[policy.training.seed] = policy.load().to(device)
-    return {method: actors for method, actors in found.items() if actors.keys() == seeds}
+            by_method.setdefault(policy.method, {})[policy.training.seed] = policy.load().to(device)
+    return {method: actors for method, actors in by_method.items() if actors.keys() == seeds}
 
 
 def finished_policies(run: Path, options: Options) -> list[Policy]:
-    """The policies of a finished run by the methods that are asked for; its data are read again."""
+    """Return the policies of a finished run for the methods that are asked for; its data are read again."""
     stored = of_run(options, run)
     policies = policies_of(with_parts(stored, evaluation={"grid": options.evaluation.grid}))
     methods = " ".join(stored_options(Options, run, None).sources.prior)
@@ -307,32 +308,32 @@ def finished_policies(run: Path, options: Options) -> list[Policy]:
 
 @dataclass(frozen=True)
 class Cell:
-    """How a policy is played: the episodes of a cell make one row."""
+    """The settings with which a policy is played; the episodes of a cell make one row."""
 
-    checkpoint: int  # of the policy's training, an iteration
+    checkpoint: int  # iteration of the training at which the policy was saved
     nfe: int  # network evaluations per chunk
-    delay: int | None = None  # control steps until chunks take effect; None: the simulator waits
-    execute: int | None = None  # actions per decision; all H by default
+    delay: int | None = None  # control steps until a chunk takes effect; None if the simulator waits
+    execute: int | None = None  # executed actions per decision; H by default
     guidance: RealTimeChunking | None = None
     temperature: float = 1.0  # factor of the source's noise
 
     def facts(self) -> dict[str, Any]:
-        found: dict[str, Any] = {
+        facts: dict[str, Any] = {
             "checkpoint": self.checkpoint,
             "nfe": self.nfe,
             "temperature": self.temperature,
         }
         if self.delay is not None:
             guidance = "none" if self.guidance is None else "rtc"
-            found |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}
-        return found
+            facts |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}
+        return facts
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {value}" for name, value in self.facts().items())
 
 
 def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
-    """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
+    """Play episodes; their noise depends on the seeds of policy and episode only."""
     actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
     task = policy.task()
     outcome: dict[str, Any] = {"success": task.success, "measures": task.measures}
@@ -342,7 +343,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
 
 @lru_cache(maxsize=1)
 def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
-    """A policy and its environment: an episode after one of the same policy needs no preparation."""
+    """Return a policy and its environment, kept for the next episodes of the same policy."""
     key = (policy.data, *policy.place, policy.network.observation_steps)
     actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance, temperature=cell.temperature)
     base = simulator(key, play_on)
@@ -351,22 +352,24 @@ def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor,
 
 @lru_cache(maxsize=1)
 def simulator(task: tuple[Any, ...], play_on: bool) -> EnvBase:
-    """The environment of a task; building a simulator takes a second, so it serves all policies."""
+    """Return the environment of a task, kept for all policies, because building it takes a second."""
     return cached_task(*task).make_env(**({"terminate_on_success": False} if play_on else {}))
 
 
 def row(
     policy: Policy, cell: Cell, episodes: Iterable[Episode], measures: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The row of a cell: what the policy is, how it was played, and what came out."""
-    # Sums depend on the order: that of the seeds, not that in which the episodes ended.
+    """Return the row of a cell: the policy, how it was played, and the results."""
+    # Sums depend on the order, so episodes are sorted by their seeds.
     episodes = sorted(episodes, key=lambda episode: episode.seed)
     decisions = torch.cat([episode.decisions for episode in episodes])
     # Episodes of a single decision have no boundary between chunks.
     several = any(len(episode.decisions) > 1 for episode in episodes)
     smooth = smoothness(decisions) if several else None
     solved = [episode.success for episode in episodes]
-    own = {name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures}
+    values_by_measure = {
+        name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures
+    }
     return {
         **policy.facts,
         **cell.facts(),
@@ -377,8 +380,8 @@ def row(
         "boundary_jump": None if smooth is None else smooth.boundary_jump,
         "inner_jump": None if smooth is None else smooth.inner_jump,
         "mean_revision": mean_revision(decisions),
-        # A measure of an episode may be called what a column is called.
-        **{f"episode_{name}": sum(values) / len(values) for name, values in own.items()},
+        # The prefix keeps a task's measures apart from other columns.
+        **{f"episode_{name}": sum(values) / len(values) for name, values in values_by_measure.items()},
         **measures,
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),
@@ -386,12 +389,12 @@ def row(
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Write a file of rows in the place of another, and read it again as a table."""
-    # JSON has no NaN: what is not known is null.
-    known = [
+    """Write or replace a file of rows, and return it as a table."""
+    # JSON has no NaN, so null stands for it.
+    finite = [
         {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
         for row in rows
     ]
-    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in known)
+    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite)
     write_atomic(path, lambda path: path.write_text(text))
     return pd.DataFrame(read_rows(path))

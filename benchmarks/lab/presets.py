@@ -11,11 +11,11 @@ from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.options import PAPER, PRETRAINED
 
 PRESETS: dict[str, Options] = {
-    # One seed, a small network and half of the training that the tables have: a first table.
+    # A first table: one seed, a small network, and half of the training of the published tables.
     "quick": Options(data=DataOptions(demonstrations=(100,)), training=TrainingConfig(iterations=5_000)),
-    # Twice the training and the episodes, three seeds.
+    # Three seeds, with twice the training and the episodes.
     "cpu": Options(data=DataOptions(demonstrations=(150, 300)), evaluation=Evaluation(seeds=3, episodes=50)),
-    # The paper's: 20M parameters, 200k iterations.
+    # The paper's experiment: 20M parameters, 200k iterations.
     "paper": Options(
         data=DataOptions(demonstrations=(200, 300)),
         network=NetworkOptions(network="chi_transformer", precondition=False),
@@ -23,8 +23,9 @@ PRESETS: dict[str, Options] = {
         evaluation=Evaluation(seeds=3, episodes=200, top_k=3),
     ),
 }
-# The same with the answers of the public code that the paper may stand on, Much Ado About Noising, where it
-# has others (docs/notes/paper_readings.md). It clips a tenth of the loss's gradient to a norm of 10.
+# The same, with the details of the public code that the paper may build on, Much Ado About Noising, where
+# they differ (docs/notes/paper_readings.md). That code clips the gradient of a tenth of the loss to a norm of
+# 10, so the norm here is 100.
 PRESETS["much-ado"] = with_parts(
     PRESETS["paper"],
     data={"actions": "absolute"},
@@ -33,8 +34,8 @@ PRESETS["much-ado"] = with_parts(
     evaluation={"temperature": (0.0,)},
 )
 
-# What a preset does differently where policies see images. Small images and networks, and a task that is
-# solved from them: 15 minutes on two cores.
+# Changes of a preset for policies that see images. Small images and networks, on a task that they solve: 15
+# minutes on two cores.
 SMALL_IMAGES: dict[str, dict[str, Any]] = {
     "data": {"image_size": 48, "fast_rendering": True},
     "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
@@ -45,7 +46,7 @@ IMAGES: dict[str, dict[str, dict[str, Any]]] = {
     "cpu": SMALL_IMAGES,
     "paper": {"training": {"batch_size": 256}},
     "much-ado": {
-        "data": {"actions": "delta"},  # images go with no others
+        "data": {"actions": "delta"},  # image policies support no others
         "network": {"encoder": "resnet18"},
         "training": {"batch_size": 256},
     },
@@ -53,18 +54,19 @@ IMAGES: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def adapted[O: Options](preset: O, typed: Options) -> O:
-    """A preset for what policies are to see.
+    """Return a preset for the observations that were asked for.
 
-    Where ImageNet's weights cannot be had, an encoder that would start from them starts from random ones.
+    If ImageNet's weights cannot be downloaded, an encoder that the preset starts from them starts from random
+    weights.
     """
     if "image" not in (typed.data.obs, preset.data.obs):
         return preset
     if preset.data.obs == "state":
-        changed = {part: dict(values) for part, values in IMAGES[typed.run.preset].items()}
-        changed["data"] = {**changed.get("data", {}), "obs": "image"}
+        changes = {part: dict(values) for part, values in IMAGES[typed.run.preset].items()}
+        changes["data"] = {**changes.get("data", {}), "obs": "image"}
         if typed.run.preset == "quick" and not preset.data.task:
-            changed["data"] |= {"task": ("lift",), "demonstrations": (100,)}
-        preset = with_parts(preset, **changed)
+            changes["data"] |= {"task": ("lift",), "demonstrations": (100,)}
+        preset = with_parts(preset, **changes)
     if preset.network.encoder == typed.network.encoder == PRETRAINED:
         try:
             imagenet_weights()
@@ -75,5 +77,5 @@ def adapted[O: Options](preset: O, typed: Options) -> O:
 
 
 def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
-    """A preset of a study: that of the comparison, with further parts or others."""
+    """Return a preset of a study: the comparison's preset with some parts replaced or added."""
     return kind(**vars(preset) | parts)

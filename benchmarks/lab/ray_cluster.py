@@ -1,4 +1,4 @@
-"""A Ray cluster whose machines can do this library's work."""
+"""Connections to a Ray cluster, whose machines are checked."""
 
 from __future__ import annotations
 
@@ -22,16 +22,24 @@ from warmprior.io.files import write_atomic
 from warmprior.io.workers import WorkerError, stop_forking
 
 PATIENCE = 60.0
-"""Seconds in which a cluster has to answer; each machine has three times as long to import this library."""
+"""Seconds that a cluster has to answer; each machine has three times as long to import this library."""
 
 CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
-"""What a process does to find out whether there is a cluster."""
+"""The code of a process that tests the connection."""
 
 
 def check_ray(address: str | None = None) -> str | None:
-    """Refuse a cluster that cannot be reached: ``HOST:PORT`` of its head, or ``auto``; or ``$RAY_ADDRESS``.
+    """Check that a cluster can be reached, and return its address.
 
-    Returns the address, or ``None`` for a cluster of this machine alone, which has yet to be started.
+    Args:
+        address: ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``.
+
+    Returns:
+        The address, or ``None`` for a cluster of this machine alone, which has to be started.
+
+    Raises:
+        ValueError: if the address has another form.
+        ConnectionError: if the cluster does not answer.
     """
     require("ray", "ray")
     option = "--ray-address" if address else "RAY_ADDRESS"
@@ -45,32 +53,32 @@ def check_ray(address: str | None = None) -> str | None:
             "start from one of its machines, not through ray://"
         )
     try:
-        if address != "auto":  # fails at once where nobody listens
+        if address != "auto":  # fails at once if nothing listens
             socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
-        # In a process of its own: Ray itself goes on trying for minutes, and cannot be interrupted.
+        # In a separate process, because Ray retries for minutes and cannot be interrupted.
         command = [sys.executable, "-c", CONNECT, address]
-        done = subprocess.run(command, stderr=subprocess.PIPE, timeout=PATIENCE, check=False)
-        if done.returncode == 0:
+        process = subprocess.run(command, stderr=subprocess.PIPE, timeout=PATIENCE, check=False)
+        if process.returncode == 0:
             return address
-        reason = reason_of(done.stderr)
+        reason = reason_of(process.stderr)
     except subprocess.TimeoutExpired as late:
         reason = f"it does not answer within {PATIENCE:g} seconds. {reason_of(late.stderr or b'')}"
     except (OSError, OverflowError) as error:
         reason = str(error)
     raise ConnectionError(
-        f"{option} {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
+        f"{option} {address} is no cluster that answers: {reason.strip(' .')}. Start one with ray start "
         "--head (RAY_AUTH_MODE=token if it asks for a token), or leave out --ray-address and RAY_ADDRESS for "
         "this machine alone"
     )
 
 
 def reason_of(text: bytes) -> str:
-    """The message at the end of what a Python process, or Ray, wrote before it ended."""
+    """Return the last error message in the output of a Python process or of Ray."""
     return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", text.decode(), flags=re.M)[-1].strip()
 
 
-def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
-    """Refuse a machine with other versions: it might compute something else.
+def check_versions(local: Mapping[str, str], remote: Mapping[str, str], node: str) -> None:
+    """Raise WorkerError if a machine has other versions, which might give other results.
 
     Examples:
         >>> from lab.ray_cluster import check_versions
@@ -79,47 +87,51 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str
             ...
         warmprior.io.workers.WorkerError: node-7 has torch 2.10.0, and this process 2.11.0: ...
     """
-    for name, here in mine.items():
-        there = theirs.get(name, "none")
-        if there != here:
+    for name, local_version in local.items():
+        remote_version = remote.get(name, "none")
+        if remote_version != local_version:
             raise WorkerError(
-                f"{node} has {name} {there}, and this process {here}: install the same everywhere"
+                f"{node} has {name} {remote_version}, and this process {local_version}: install the same "
+                "version everywhere"
             )
 
 
 def versions() -> dict[str, str]:
-    """Of what has to be the same on all machines."""
+    """Return the versions that have to be the same on all machines."""
     packages = ("warmprior", "torch", "torchrl", "tensordict")
     return {"Python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def _look(tokens: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """On a machine: its versions, and the files of ``tokens`` that it does not see as they were written."""
+    """Return a machine's versions, and the files of ``tokens`` that it does not see as written."""
 
-    def seen(path: str) -> str | None:
+    def content(path: str) -> str | None:
         try:
             return Path(path).read_text()
         except OSError:
             return None
 
-    return versions(), [path for path, token in tokens.items() if seen(path) != token]
+    return versions(), [path for path, token in tokens.items() if content(path) != token]
 
 
 @contextlib.contextmanager
 def ray_cluster(
     address: str | None = None, num_cpus: int | None = None, folders: Sequence[Path] = ()
 ) -> Iterator[Any]:
-    """A connection to a Ray cluster whose machines can do this library's work; yields the module ``ray``.
+    """Connect to a Ray cluster, check its machines, and yield the module ``ray``.
 
-    One that this process has already is taken, and left as it is. Without an address (see :func:`check_ray`)
-    one of this machine is started, and ended. All machines have to share the ``folders``. A ``WorkerError``
-    if one has other versions or cannot start the library, an ``OSError`` if it does not see a folder.
+    An existing connection of this process is used and left open. Without an address (see :func:`check_ray`) a
+    cluster of this machine is started, and ended afterwards. All machines have to share the ``folders``.
+
+    Raises:
+        WorkerError: if a machine has other versions or cannot start the library.
+        OSError: if a machine does not see a folder.
     """
     ray = require("ray", "ray")
     with contextlib.ExitStack() as stack:
         if not ray.is_initialized():
             address = check_ray(address)
-            # Workers look for modules where this process does.
+            # Workers import modules from the same places as this process.
             path = os.pathsep.join(map(os.path.abspath, sys.path))
             options: dict[str, Any] = {
                 "address": address or "local",
@@ -128,7 +140,7 @@ def ray_cluster(
             if address is None:
                 cores = num_cpus or available_cores()
                 options |= {"num_cpus": cores, "include_dashboard": False}
-            stop_forking()  # a connection does not survive it
+            stop_forking()  # a connection does not survive a fork
             stack.callback(ray.shutdown)
             with _unreachable() if address is None else contextlib.nullcontext():
                 ray.init(**options, logging_level="ERROR")
@@ -142,10 +154,10 @@ def ray_cluster(
 
 @contextlib.contextmanager
 def _unreachable() -> Iterator[None]:
-    """Let Ray's processes, which run what they are sent, listen on this machine's loopback alone.
+    """Let Ray's processes listen on this machine's loopback only, because they run any code they are sent.
 
-    It does so by itself where it supports no clusters, and turns any loopback address that it is given into
-    one that others reach.
+    Ray does so only if its support of clusters is off; otherwise it replaces a loopback address by one that
+    other machines reach.
     """
     from ray._private import ray_constants
 
@@ -155,21 +167,21 @@ def _unreachable() -> Iterator[None]:
 
 
 def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> Any:
-    """A task that tells what a machine has and sees."""
+    """Start :func:`_look` on a machine."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-    return ray.remote(_look).options(num_cpus=0, scheduling_strategy=there).remote(tokens)
+    strategy = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+    return ray.remote(_look).options(num_cpus=0, scheduling_strategy=strategy).remote(tokens)
 
 
 def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
     name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     try:
-        theirs, unseen = ray.get(look, timeout=3 * PATIENCE)
+        remote, unseen = ray.get(look, timeout=3 * PATIENCE)
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
         raise WorkerError(f"{name} cannot start this library: {cause}") from error
-    check_versions(versions(), theirs, name)
+    check_versions(versions(), remote, name)
     if unseen:
         raise OSError(
             f"{name} does not see what is written to {Path(unseen[0]).parent} here: choose an --out that "
@@ -179,7 +191,7 @@ def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
 
 @contextlib.contextmanager
 def _tokens(folders: Sequence[Path]) -> Iterator[dict[str, str]]:
-    """A new file in each folder, and its content."""
+    """Write a new file to each folder; yield their content by path."""
     token = uuid.uuid4().hex
     paths = [folder.absolute() / f".shared-{token}" for folder in folders]
     try:

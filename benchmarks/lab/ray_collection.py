@@ -1,4 +1,4 @@
-"""Transitions from many machines, through TorchRL's own collector on Ray."""
+"""Transitions from many machines, by TorchRL's collector on Ray."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from warmprior.io.workers import WorkerError, stop_forking
 from warmprior.rl.agent import WarmUpSwitch
 
 EPISODES_APART = 10_000
-"""Between the seeds of two collectors."""
+"""Distance between the seeds of two collectors."""
 
 
 def _actor_class() -> type:
-    """The class of an actor: TorchRL's collector, adapted to Ray."""
+    """Return the class of an actor: TorchRL's collector, adapted to Ray."""
     from torchrl.collectors import Collector
 
     class Actor(Collector):
@@ -37,7 +37,7 @@ def _actor_class() -> type:
 
 
 def _make_env(make_env: Callable[[int], EnvBase], seed: int, path: list[str]) -> EnvBase:
-    """Runs in an actor: makes its environment and seeds its draws."""
+    """Make the environment of an actor, in its process, and seed its draws."""
     stop_forking()
     sys.path.extend(place for place in path if place not in sys.path)
     torch.set_num_threads(1)
@@ -55,19 +55,24 @@ def ray_rounds(
     seed: int,
     address: str | None = None,
 ) -> Iterator[Iterator[TensorDictBase]]:
-    """Rounds of decisions, ``[collectors, num_envs, 1]``: one by each environment of several Ray actors.
+    """Yield rounds of decisions, ``[collectors, num_envs, 1]``: one per environment of several Ray actors.
 
-    Before every round all receive the current weights of ``policy``, and wait for the slowest. Actor ``i``
-    has a CPU and draws from ``seed + 10_000 * i``, so the same arguments give the same decisions on any
-    number of machines. A ``ValueError`` if the cluster has too few CPUs, a ``WorkerError`` if an actor dies
-    or its environment fails.
+    Before every round all actors receive the current weights of ``policy``; a round waits for the slowest.
+    Actor ``i`` has a CPU and draws from ``seed + 10_000 * i``, so the same arguments give the same decisions
+    on any number of machines.
+
+    Raises:
+        ValueError: if the cluster has too few CPUs.
+        WorkerError: if an actor dies or its environment fails.
     """
     with ray_cluster(address, collectors) as ray:
         from torchrl.collectors.distributed import RayCollector
 
         cores = int(ray.cluster_resources().get("CPU", 0))
         if cores < collectors:
-            raise ValueError(f"--collectors {collectors} need a CPU each, and the cluster has {cores}")
+            raise ValueError(
+                f"--collectors {collectors}: the cluster has {cores} CPUs, and each collector needs one"
+            )
         makers: list[Any] = [
             partial(_make_env, make_env, seed + EPISODES_APART * i, list(sys.path)) for i in range(collectors)
         ]

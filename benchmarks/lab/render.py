@@ -1,4 +1,4 @@
-"""Turns the simulator states of demonstrations into images."""
+"""Images for demonstrations, rendered from their simulator states."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def render_demonstrations(
 
     The result, whose path is returned, is a copy of the file in robomimic's layout, with
     ``obs/<camera>_image`` uint8 ``[N, size, size, 3]``, upright and compressed, in every demo, without
-    ``next_obs``. Images of other cameras stay. It appears when it is complete; finished demos lie in a folder
-    next to it until then, from which an interrupted call continues. The number of workers changes nothing.
+    ``next_obs``. Images of other cameras stay. The file is written atomically; until then finished demos are
+    in a folder next to it, so that an interrupted call continues. The result does not depend on the number of
+    workers.
 
     Args:
         path: a robomimic HDF5 file with states.
@@ -45,20 +46,20 @@ def render_demonstrations(
         size: side of the images in pixels.
 
     Keyword Args:
-        demos: how many to render and keep, the first ones by their numbers; all if ``None``.
+        demos: number of demonstrations to render and keep, from the first on; all if ``None``.
         fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache
+        out: file to write or replace, which may be ``path`` itself. ``None`` for the cache
             (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set), from which a file rendered
             earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        DatasetError: if it holds no states, those of another simulator, or some that are not finite.
-        ValueError: if there is no such camera, an option is out of range, or images of other cameras in the
-            file were rendered in the other quality.
-        RuntimeError: if nothing here can render.
-        OSError: if the disk is full; what is finished stays.
+        DatasetError: if the file has no states, states of another simulator, or states that are not finite.
+        ValueError: if a camera is unknown, an option is out of range, or the file's images of other cameras
+            were rendered in the other quality.
+        RuntimeError: if no rendering backend works.
+        OSError: if the disk is full; finished demos are kept.
 
     Examples:
         >>> from lab.render import render_demonstrations
@@ -107,7 +108,7 @@ def render_demonstrations(
         count = {"initial": len(index.demos) - len(missing), "total": len(index.demos)}
         bar = tqdm(desc=f"render {path.stem}", unit="demo", **count)
         with working(workers, illustrator) as call, bar:
-            call(_Illustrator.check).result()  # before hours are spent
+            call(_Illustrator.check).result()  # before hours of rendering
             for future in as_completed([call(partial(_Illustrator.render, demo=demo)) for demo in missing]):
                 future.result()
                 bar.update()
@@ -119,7 +120,7 @@ def render_demonstrations(
 
 
 class _Illustrator(StateRenderer):
-    """Renders the demos of a file; its simulator is made in the worker that renders."""
+    """Renders the demos of a file; the simulator is made in the worker process."""
 
     def __init__(
         self, index: DatasetIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
@@ -128,19 +129,21 @@ class _Illustrator(StateRenderer):
         self.cameras, self.parts = cameras, parts
 
     def part(self, demo: str) -> Path:
-        """Where the images of a finished demo wait for the others."""
+        """Return the temporary file of a finished demo's images."""
         return self.parts / f"{demo}.npz"
 
     def positions(self, demo: str) -> np.ndarray:
-        """Positions of all joints before every action, ``[N, nq]``."""
+        """Return the positions of all joints before every action, ``[N, nq]``."""
         path, name = self.index.path, f"data/{demo}/states"
         with open_robomimic(path) as file:
             states = member(file, name, "dataset")
             if states is None:
-                raise DatasetError(f"{path}: data/{demo} has no states to render: record them")
+                raise DatasetError(
+                    f"{path}: data/{demo} has no states to render: record the file with states"
+                )
             with reading(file, name):
-                found = np.asarray(states[()])
-        return self.joints(found, self.index.lengths[self.index.demos.index(demo)], f"{path}: {name}")
+                values = np.asarray(states[()])
+        return self.joints(values, self.index.lengths[self.index.demos.index(demo)], f"{path}: {name}")
 
     def check(self) -> None:
         """Render one image of every camera."""
@@ -163,7 +166,7 @@ class _Illustrator(StateRenderer):
 
 
 def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool) -> list[str]:
-    """Other cameras whose images are known to be of the quality that is asked for: one goes for a file."""
+    """Return other cameras with images; raise ValueError if these have the other quality."""
     before, _ = read_origin(path, index.demos[0])
     if before is None:
         return []
@@ -171,14 +174,14 @@ def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fa
     if kept and bool(before["fast"]) != fast:
         raise ValueError(
             f"{path}: its images of {', '.join(kept)} were rendered {'in full quality' if fast else 'fast'}, "
-            f"and one quality goes for all: {'leave out' if fast else 'add'} --fast, or render all cameras "
+            f"and a file has one quality: {'leave out' if fast else 'add'} --fast, or render all cameras "
             f"(--cameras {' '.join([*kept, *cameras])})"
         )
     return kept
 
 
 def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
-    """The file with the images of the demos, and with its masks if all of them are in it."""
+    """Write the file with the images of the demos, and its masks if no demo is left out."""
     h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
     kwargs = {"camera_names": list(illustrator.cameras), "camera_heights": size, "camera_widths": size}
     env_args = index.env_args | {"env_kwargs": index.env_args["env_kwargs"] | kwargs}

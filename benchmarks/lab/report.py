@@ -1,7 +1,7 @@
-"""Tables of the benchmarks: rows of `results.jsonl` in, Markdown and a short text for a terminal out.
+"""Tables of the benchmarks: from rows of `results.jsonl` to Markdown, and to a short text for a terminal.
 
-A row is one evaluation of one policy: what was measured (task, prior, seed, nfe, ...), and what came out.
-Its columns, and those of all tables, are defined in `columns.py`. The first method is the baseline.
+A row is one evaluation of one policy: what was evaluated (task, prior, seed, nfe, ...), and the results. The
+columns of rows and tables are defined in `columns.py`. Methods are compared with the first one.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from warmprior.diagnostics import success_posterior
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
 
-FACTS = ["task", "data", "prior", "options", "sigma", "chunk"]  # of a method, beside its name
-RELATIVE = ["kappa", "relative_curvature", "bound", "training_seconds"]  # also over the baseline's
-BOUNDS = {"source_leak": LEAK_BOUND, "inner_step_ratio": INNER_STEP_BOUND}  # marked above
-SHOWN = [  # below the success rates of report.md
+FACTS = ["task", "data", "prior", "options", "sigma", "chunk"]  # columns that describe a method
+RELATIVE = ["kappa", "relative_curvature", "bound", "training_seconds"]  # also shown as ratios
+BOUNDS = {"source_leak": LEAK_BOUND, "inner_step_ratio": INNER_STEP_BOUND}  # values above are marked (!)
+SHOWN = [  # columns below the success rates of report.md
     *("success", "better", "won", "lost", "paired", *BOUNDS, "memory_gain", "boundary_jump", "inner_jump"),
     *(f"{name}_ratio" for name in RELATIVE),
     *("coverage", "mean_error", "mean_revision_data", "mean_revision"),
@@ -43,22 +43,22 @@ SHOWN = [  # below the success rates of report.md
 
 
 def text_of(row: Mapping[str, Any], name: str) -> str:
-    """A text of a row, empty where it has none."""
+    """Return a text of a row, empty if it has none."""
     value = row.get(name)
     return value if isinstance(value, str) else ""
 
 
 def setting_title(row: Mapping[str, Any]) -> str:
-    """Task and style, with actions and observations where they are not the usual ones."""
+    """Return task and style, with actions and observations if they are unusual."""
     spaces = ((text_of(row, "actions"), "actions"), (text_of(row, "obs"), "observations"))
     title = f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
     return ", ".join([title, *(f"{space} {words}" for space, words in spaces if space)])
 
 
 def labelled(rows: DataFrame, *apart: str) -> DataFrame:
-    """The rows with their `method` and `setting` in words.
+    """Return the rows with their `method` and `setting` in words.
 
-    Sigma and H belong to the name of a method where several occur, unless a table has them `apart`.
+    The name of a method includes sigma and H if several occur, unless a table has them as columns (`apart`).
     """
     sigmas = rows.groupby("prior")["sigma"].transform("nunique") > 1
     several = "chunk" not in apart and rows["chunk"].nunique() > 1
@@ -76,11 +76,10 @@ def labelled(rows: DataFrame, *apart: str) -> DataFrame:
 
 
 def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
-    """A row per training and way to play it, of its best `top_k` checkpoints.
+    """Return a row per training and setting of play, averaged over its best `top_k` checkpoints.
 
-    Everything that depends on the checkpoint is of the same ones. They played the same episodes, so that an
-    episode counts once, by the mean of its outcomes: `solved`, from which all that a report says of success
-    follows.
+    All measures are averaged over the same checkpoints. These played the same episodes, so an episode counts
+    once, with the mean of its outcomes (`solved`); reports derive all numbers on success from that.
     """
     keys = [name for name in ("policy", "nfe", "delay", "guidance", "temperature") if name in rows]
     groups = rows.reset_index(drop=True).groupby(keys, sort=False, dropna=False)
@@ -103,18 +102,18 @@ def _of_best(group: DataFrame, top_k: int) -> Series:
 
 
 def at_fewest(rows: DataFrame) -> DataFrame:
-    """The rows at the fewest network evaluations of every method, which may have a number of its own."""
+    """Return the rows at each method's smallest NFE."""
     return rows[rows["nfe"] == rows.groupby("method")["nfe"].transform("min")]
 
 
 def pooled(rows: DataFrame) -> DataFrame:
-    """Curvatures averaged over the training seeds, or those of the only seed."""
+    """Return the rows averaged over training seeds, or those of the only seed."""
     average = rows["seed"].isna()
     return rows[average if average.any() else rows["seed"] == rows["seed"].min()]
 
 
 def summary(rows: DataFrame, top_k: int) -> DataFrame:
-    """All that is known per setting, method (delay) and NFE, beside the first method's."""
+    """Return a row per setting, method and NFE (and delay, temperature), compared with the first method."""
     seeds = per_seed(labelled(rows), top_k)
     seeds = seeds.assign(**seeds.reindex(columns=[*RELATIVE, *BOUNDS, "memory_gain"]).astype(float))
     keys = [name for name in ("setting", "method", "delay", "nfe", "temperature") if name in seeds]
@@ -132,67 +131,67 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     }
     measures = [name for name in seeds.select_dtypes("number") if name not in {*counted, "checkpoints"}]
     spread = groups[measures].std().dropna(axis=1, how="all").add_suffix("_std")
-    found = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
-    found = found.assign(seeds=groups.size()).join(groups[measures].mean()).join(spread).reset_index()
-    counts = found[["successes", "episodes"]].to_numpy()
+    result = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
+    result = result.assign(seeds=groups.size()).join(groups[measures].mean()).join(spread).reset_index()
+    counts = result[["successes", "episodes"]].to_numpy()
     intervals = [success_posterior(*pair).interval(0.95) for pair in counts]
-    found["low"], found["high"] = zip(*intervals, strict=True)
+    result["low"], result["high"] = zip(*intervals, strict=True)
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
-    found["paper"] = [paper_success(row) for row in firsts]
-    return _beside(found, seeds, keys)
+    result["paper"] = [paper_success(row) for row in firsts]
+    return _beside(result, seeds, keys)
 
 
-def _beside(found: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame:
-    """A summary with what compares each method to the first one, at the same place and NFE."""
-    first, place = found["method"].iloc[0], [name for name in keys if name != "method"]
-    base = found[found["method"] == first].set_index(place)
-    theirs = base.reindex(pd.MultiIndex.from_frame(found[place])).set_index(found.index)
-    other = found["method"] != first
-    found["gain"] = (found["success"] - theirs["success"]).where(other)
-    deviations = [part.get("success_std", math.nan) for part in (found, theirs)]
-    found["one_sigma"] = found["gain"] > deviations[0] + deviations[1]
-    pairs = found[["successes", "episodes"]].join(theirs[["successes", "episodes"]], rsuffix="_first")
-    found["better"] = [
+def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame:
+    """Add to a summary the comparison of each method with the first one in the same setting and NFE."""
+    first, place = rows["method"].iloc[0], [name for name in keys if name != "method"]
+    rows_of_first = rows[rows["method"] == first].set_index(place)
+    first_rows = rows_of_first.reindex(pd.MultiIndex.from_frame(rows[place])).set_index(rows.index)
+    other = rows["method"] != first
+    rows["gain"] = (rows["success"] - first_rows["success"]).where(other)
+    deviations = [part.get("success_std", math.nan) for part in (rows, first_rows)]
+    rows["one_sigma"] = rows["gain"] > deviations[0] + deviations[1]
+    pairs = rows[["successes", "episodes"]].join(first_rows[["successes", "episodes"]], rsuffix="_first")
+    rows["better"] = [
         probability_better(*counts) if not math.isnan(gain) else math.nan
-        for counts, gain in zip(pairs.to_numpy(), found["gain"], strict=True)
+        for counts, gain in zip(pairs.to_numpy(), rows["gain"], strict=True)
     ]
-    # Episodes of equal seeds, of trainings with equal seeds.
+    # Episodes are paired by their seeds, and trainings by theirs.
     both = seeds[seeds["method"] != first].merge(
         seeds[seeds["method"] == first], on=[*place, "seed"], suffixes=("", "_first")
     )
-    apart = [mine - first for mine, first in both[["solved", "solved_first"]].to_numpy()]
-    both["won"] = [pairs.clip(min=0).sum() for pairs in apart]
-    both["lost"] = [-pairs.clip(max=0).sum() for pairs in apart]
-    found = found.join(both.groupby(list(keys))[["won", "lost"]].sum(), on=list(keys))
-    found["paired"] = [
+    differences = [one - first for one, first in both[["solved", "solved_first"]].to_numpy()]
+    both["won"] = [pairs.clip(min=0).sum() for pairs in differences]
+    both["lost"] = [-pairs.clip(max=0).sum() for pairs in differences]
+    rows = rows.join(both.groupby(list(keys))[["won", "lost"]].sum(), on=list(keys))
+    rows["paired"] = [
         math.nan if math.isnan(won) else paired_probability_better(won, lost)
-        for won, lost in found[["won", "lost"]].to_numpy()
+        for won, lost in rows[["won", "lost"]].to_numpy()
     ]
-    # A flow is the same at any NFE, and the baseline may lack this one.
+    # A flow does not depend on NFE, and the first method may not be played at this one.
     flows = seeds[seeds["method"] == first].groupby("setting")[RELATIVE].mean()
     for name in RELATIVE:
-        found[f"{name}_ratio"] = found[name] / found["setting"].map(flows[name]).replace(0.0, math.nan)
-    return found
+        rows[f"{name}_ratio"] = rows[name] / rows["setting"].map(flows[name]).replace(0.0, math.nan)
+    return rows
 
 
 # Tables
 
 
 def table(rows: DataFrame, keys: Sequence[str], names: Iterable[str], notes: Sequence[str] = ()) -> str:
-    """A line per combination of `keys`, in the order of the rows, and a column per key and name.
+    """Return a table in Markdown: a line per combination of `keys`, a column per key and name.
 
-    A cell has the mean of a column and, over several rows, its standard deviation. Names that no row knows
-    are left out.
+    An entry is the mean over the rows with, for several rows, their standard deviation. Columns without any
+    value are left out.
     """
-    known = [name for name in names if name in rows and rows[name].notna().any()]
+    present = [name for name in names if name in rows and rows[name].notna().any()]
     lines = []
     for _, group in rows.groupby(list(keys), sort=False, dropna=False):
         start = {key: format(group[key].iloc[0], column(key)[0]) for key in keys}
-        lines.append(start | {name: _cell(group, name) for name in known})
+        lines.append(start | {name: _entry(group, name) for name in present})
     return markdown(DataFrame(lines), notes)
 
 
-def _cell(group: DataFrame, name: str) -> str:
+def _entry(group: DataFrame, name: str) -> str:
     form, values = column(name)[0], group[name].dropna().astype(float)
     if values.empty:
         return "-"
@@ -208,64 +207,64 @@ def _cell(group: DataFrame, name: str) -> str:
 
 
 def markdown(frame: DataFrame, notes: Sequence[str] = ()) -> str:
-    """A table of texts in Markdown, with a list of notes below it."""
+    """Return a table of texts in Markdown, with a list of notes below it."""
     lines = [list(frame.columns), ["---"] * len(frame.columns), *frame.to_numpy().tolist()]
     text = [f"| {' | '.join(line)} |" for line in lines]
     return "\n".join([*text, *([""] if notes else []), *(f"- {note}" for note in notes)]) + "\n"
 
 
-def wide(found: DataFrame, cells: Series, index: str, columns: str) -> DataFrame:
-    """A pivot of texts of a summary, in its order; the largest NFE stands first."""
-    found = found.assign(cell=cells).sort_values("nfe", ascending=False, kind="stable")
-    order = found[columns].unique()
-    pivot = found.pivot(index=index, columns=columns, values="cell")
-    return pivot.reindex(index=pd.unique(found.sort_index()[index]), columns=order).fillna("-")
+def wide(rows: DataFrame, texts: Series, index: str, columns: str) -> DataFrame:
+    """Return a pivot of texts in the order of the rows, with the largest NFE first."""
+    rows = rows.assign(entry=texts).sort_values("nfe", ascending=False, kind="stable")
+    order = rows[columns].unique()
+    pivot = rows.pivot(index=index, columns=columns, values="entry")
+    return pivot.reindex(index=pd.unique(rows.sort_index()[index]), columns=order).fillna("-")
 
 
 # Reports
 
 
-def _placed(found: DataFrame) -> DataFrame:
-    """A summary with the `place` where methods compare, and the `text` of a success with its gain."""
-    delay = ", delay " + found["delay"].astype(str) if "delay" in found else ""
-    found = found.assign(place=found["setting"] + delay, column="NFE " + found["nfe"].astype(str))
-    if "temperature" in found and found.groupby("method")["temperature"].nunique().max() > 1:
-        found["column"] += ", noise x " + found["temperature"].map("{:g}".format)
-    best = found.groupby(["place", "column"])["success"].transform("max")
+def _placed(rows: DataFrame) -> DataFrame:
+    """Add to a summary the `place` and `column` of its entries in a table, and their `text`."""
+    delay = ", delay " + rows["delay"].astype(str) if "delay" in rows else ""
+    rows = rows.assign(place=rows["setting"] + delay, column="NFE " + rows["nfe"].astype(str))
+    if "temperature" in rows and rows.groupby("method")["temperature"].nunique().max() > 1:
+        rows["column"] += ", noise x " + rows["temperature"].map("{:g}".format)
+    best = rows.groupby(["place", "column"])["success"].transform("max")
     texts = []
-    for row, most in zip(found.to_dict("records"), best, strict=True):
-        # Where nothing is solved, nobody is the best.
+    for row, most in zip(rows.to_dict("records"), best, strict=True):
+        # If no method solves anything, none is marked as the best.
         mark = "**" if 0 < most <= row["success"] + 1e-9 else ""
         text = f"{mark}{100 * row['success']:.1f}{mark}"
         star = "*" if row["one_sigma"] else ""
         texts.append(text if math.isnan(row["gain"]) else f"{text} ({100 * row['gain']:+z.1f}{star})")
-    return found.assign(text=texts)
+    return rows.assign(text=texts)
 
 
 def _count(number: float, word: str) -> str:
     return f"{number:,.0f} {word}{'' if number == 1 else 's'}"
 
 
-def _experiment(found: DataFrame, top_k: int) -> str:
-    most = found[["seeds", "checkpoints"]].max()
-    episodes = _count((found["episodes"] / found["seeds"]).max(), "episode")
-    chunks = ", ".join(map(str, found["chunk"].unique()))
+def _experiment(rows: DataFrame, top_k: int) -> str:
+    most = rows[["seeds", "checkpoints"]].max()
+    episodes = _count((rows["episodes"] / rows["seeds"]).max(), "episode")
+    chunks = ", ".join(map(str, rows["chunk"].unique()))
     chosen = f"best {min(top_k, most['checkpoints'])} of {most['checkpoints']} checkpoints per seed"
     chosen = chosen if most["checkpoints"] > 1 else "last checkpoint"
     return f"H = {chunks}, {_count(most['seeds'], 'seed')} with {episodes} each, {chosen}"
 
 
-def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
-    """Three lines: the experiment, the best methods, and how sure it is that they beat the first.
+def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
+    """Return three lines: the experiment, the best methods, and the probability that they beat the first.
 
-    Over several settings it averages success and pools episodes.
+    Over several settings, success is averaged and episodes are pooled.
     """
-    first, settings = found["method"].iloc[0], found["setting"].unique()
+    first, settings = rows["method"].iloc[0], rows["setting"].unique()
     best, chances = [], []
     sums = {"success": "mean", "successes": "sum", "episodes": "sum", "task": "size"}
-    for nfe, group in _placed(found).sort_values("nfe", ascending=False).groupby("column", sort=False):
+    for nfe, group in _placed(rows).sort_values("nfe", ascending=False).groupby("column", sort=False):
         totals = group.sort_index().groupby("method", sort=False).agg(sums)
-        totals = totals[totals["task"] == totals["task"].max()]  # what was played everywhere
+        totals = totals[totals["task"] == totals["task"].max()]  # methods that were played in all settings
         name = totals["success"].idxmax()
         best.append(f"{name} {totals.loc[name, 'success']:.1%} at {nfe}")
         others = totals.drop(first, errors="ignore")
@@ -277,60 +276,62 @@ def headline(found: DataFrame, top_k: int, width: int = 120) -> str:
             chances.append(f"{name} {gain:+.1%}, {chance:.2f} at {nfe}")
     where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
     lines = [
-        f"{_count(found['method'].nunique(), 'method')} on {where}: {_experiment(found, top_k)}.",
+        f"{_count(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
         f"Best success: {'; '.join(best)}.",
         f"Gain over {first} and its probability: {'; '.join(chances) or 'nothing to compare'}.",
     ]
     return "\n".join(textwrap.shorten(line, width, placeholder=" ...") for line in lines)
 
 
-def terminal_table(found: DataFrame, top_k: int, width: int = 120) -> str:
-    """The headline, then a line per setting and method with a column per NFE."""
-    rows, first = _placed(found), found["method"].iloc[0]
+def terminal_table(results: DataFrame, top_k: int, width: int = 120) -> str:
+    """Return the headline, then a line per setting and method with a column per NFE."""
+    rows, first = _placed(results), results["method"].iloc[0]
     several = rows["place"].nunique() > 1
     rows["line"] = rows["place"] + ", " + rows["method"] if several else rows["method"]
     frame = wide(rows, rows["text"], "line", "column").rename_axis(index=None, columns=None)
     frame.index = [textwrap.shorten(name, width * 2 // 3, placeholder=" ...") for name in frame.index]
-    legend = f"Success (%), gain over {first}. **: the best. *: above both deviations over seeds."
+    legend = f"Success (%), gain over {first}. **: the best. *: gain above both deviations over seeds."
     legend = textwrap.shorten(legend, width, placeholder=" ...")
-    return "\n".join([headline(found, top_k, width), "", frame.to_string(line_width=width), "", legend])
+    return "\n".join([headline(results, top_k, width), "", frame.to_string(line_width=width), "", legend])
 
 
-def success_report(found: DataFrame, top_k: int, notes: Sequence[str] = (), source: str | None = None) -> str:
-    """Table 1 in the paper's layout, with its numbers, and below it all measures of every method.
+def success_report(
+    results: DataFrame, top_k: int, notes: Sequence[str] = (), source: str | None = None
+) -> str:
+    """Return Table 1 in the paper's layout, with the paper's numbers, and a table of all measures.
 
-    `source` names the demonstrations: `official` ones are those of the paper.
+    `source` says where the demonstrations are from; the paper's are `official`.
     """
-    rows, first = _placed(found), found["method"].iloc[0]
+    rows, first = _placed(results), results["method"].iloc[0]
     rows["column"] = rows["column"] + ": " + rows["method"]
     paper = (100 * rows["paper"]).map("{:.1f}".format, na_action="ignore")
     lines = {f"measured ({source or 'own'} data)": rows["text"], "paper (official data)": paper}
-    parts = [wide(rows, cells, "place", "column") for cells in lines.values()]
+    parts = [wide(rows, texts, "place", "column") for texts in lines.values()]
     for part, name in zip(parts, lines, strict=True):
         part.insert(0, "Success rate (%)", part.index + ", " + name)
     frame = pd.concat(parts).sort_index(kind="stable")
     frame = frame[(frame.iloc[:, 1:] != "-").any(axis=1)]
     rule = "`*` marks a gain above the sum of both standard deviations over seeds (the paper's rule)."
     if rows["seeds"].max() == 1:
-        rule = "One seed has no spread: we mark no gain. success.png shows the episodes' posterior."
-    head = f"{_experiment(found, top_k)}. In parentheses: the gain over {first} in points. Bold: the best."
+        rule = "One seed has no spread, so no gain is marked. success.png shows the posterior over episodes."
+    head = f"{_experiment(results, top_k)}. In parentheses: the gain over {first} in points. Bold: the best."
     listed = [head, rule, *notes]
     if source not in ("official", None):
         listed.append(
-            "The paper used the official human demonstrations, and we used others. Compare gains within a "
-            "row, not numbers across rows."
+            "The paper used the official human demonstrations; these are others. Compare gains within a row, "
+            "not numbers across rows."
         )
-    keys = [name for name in ("setting", "delay", "nfe", "temperature", "method") if name in found]
-    return f"{markdown(frame, listed)}\n{table(found, keys, SHOWN)}"
+    keys = [name for name in ("setting", "delay", "nfe", "temperature", "method") if name in results]
+    return f"{markdown(frame, listed)}\n{table(results, keys, SHOWN)}"
 
 
-# What differs from run to run, or is in the first lines of a report.
+# Options that are not part of the recipe, or are in the first lines of a report.
 NO_RECIPE = {"task", "data", "dataset", "download", "force_download", "demonstrations"}
 NO_RECIPE |= {"seed", "seeds", "episodes", "nfe", "save_every", "log_every"}
 
 
 def unlike(options: Options, paper: Options) -> list[str]:
-    """What a table says of the recipe where it is not the paper's; it is the same for all sources."""
+    """Return a note on the options in which the recipe differs from the paper's, if any."""
     if options.data.obs == "image" and paper.data.obs == "state":
         paper = with_parts(paper, **IMAGES["paper"], data={"obs": "image"})
 
@@ -345,20 +346,23 @@ def unlike(options: Options, paper: Options) -> list[str]:
     def text(value: Any) -> str:
         return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
-    theirs = recipe(paper)
-    found = [
-        f"{name.replace('_', ' ')} {text(value)} ({text(theirs[name])})"
+    paper_recipe = recipe(paper)
+    changes = [
+        f"{name.replace('_', ' ')} {text(value)} ({text(paper_recipe[name])})"
         for name, value in recipe(options).items()
-        if value != theirs[name]
+        if value != paper_recipe[name]
     ]
-    words = "; ".join(found)
-    return [f"Unlike the paper (its own in parentheses), for all sources: {words}."] if found else []
+    words = "; ".join(changes)
+    return [f"Unlike in the paper (its values in parentheses), for all sources: {words}."] if changes else []
 
 
 def write_report(out: Path, short: str, full: str, frame: DataFrame, failures: Sequence[str] = ()) -> None:
-    """Write `report.md` and `results.csv`, and print the short text; then fail if anything is missing.
+    """Write `report.md` and `results.csv`, and print the short text.
 
-    The report ends with what the columns of its tables and of `results.csv` mean.
+    The report ends with the meanings of the columns.
+
+    Raises:
+        PartialFailure: if there are failures, after everything is written.
     """
     listed = "".join(f"- {failure}\n" for failure in failures)
     missing = f"\nMissing:\n\n{listed}" if failures else ""
@@ -369,11 +373,11 @@ def write_report(out: Path, short: str, full: str, frame: DataFrame, failures: S
     write_atomic(out / "results.csv", lambda path: frame.to_csv(path, index=False))
     print(f"\n{short.rstrip()}\n{missing}\nRows, report.md, results.csv and pictures: {out}", flush=True)
     if failures:
-        raise PartialFailure(f"{len(failures)} failed (--resume tries again): {'; '.join(failures)}")
+        raise PartialFailure(f"{len(failures)} failed (try again with --resume): {'; '.join(failures)}")
 
 
 def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
-    """The rows of a run's results that one of its policies played, with the facts of its demonstrations.
+    """Return the rows of a run that belong to one of its policies, with the facts of its demonstrations.
 
     ``run`` is the folder of a benchmark, ``policy`` such as ``.../policies/lift-ph-.../policy_005000``.
 
@@ -405,8 +409,8 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
     ]
     if not rows:
         raise ValueError(
-            f"{path} has no row of {folder}: name the run that played it, and the policy where that run "
-            "keeps it"
+            f"{path} has no row of {folder}: name the run that played this policy, and the policy's folder "
+            "in that run's policies/"
         )
     tasks = Path(run) / "tasks.json"
     for facts in read_json(tasks) if tasks.is_file() else ():

@@ -1,7 +1,7 @@
-"""Rows of results: what is in them, checked when they are read.
+"""Rows of results, checked when they are read.
 
-A row is one JSON object in a file of lines. Its columns are those of `columns.py`, of the types that their
-formats say.
+A row is one JSON object in a file of lines. Its columns are defined in `columns.py`; their formats say their
+types.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ REQUIRED = ("sigma", *COUNTED)
 METHOD = ("task", "data", "prior", "options", "sigma", "chunk", "seed", "nfe")
 
 PLAYED = (*METHOD, "temperature", "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
-"""A row of a policy's cell has these columns: `policies.row` writes them."""
+"""A row of a policy has these columns: `policies.row` writes them."""
 
 AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_steps", *COUNTED)
 """A row of an agent's evaluation has these columns."""
@@ -32,7 +32,7 @@ AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_ste
 def read_rows(
     path: Path, needed: Sequence[str] = (), whose: str = "a run of this script"
 ) -> list[dict[str, Any]]:
-    """Read rows that have the `needed` columns; a ``ValueError`` names the file and the line that is none.
+    """Read rows that have the `needed` columns; a ``ValueError`` names the file and the line of a bad row.
 
     Examples:
         >>> from pathlib import Path
@@ -46,13 +46,13 @@ def read_rows(
             ...
         ValueError: ...results.jsonl, line 1: nfe is 'nine', not a whole number: remove that line, ...
     """
-    rows, seen = read_lines(path), dict[tuple[Any, ...], int]()
+    rows, first_lines = read_lines(path), dict[tuple[Any, ...], int]()
     for number, row in enumerate(rows, 1):
         try:
             _check(row, needed, whose)
             identity = tuple(row.get(name) for name in IDENTITY)
-            if seen.setdefault(identity, number) != number:
-                raise ValueError(f"it is line {seen[identity]} once more")
+            if first_lines.setdefault(identity, number) != number:
+                raise ValueError(f"it repeats line {first_lines[identity]}")
         except ValueError as error:
             raise ValueError(
                 f"{path}, line {number}: {error}: remove that line, and continue with --resume"
@@ -67,8 +67,8 @@ def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
         try:
             form = column(name)[0]
         except KeyError:
-            raise ValueError(f"it has a column {name!r}, which there is not") from None
-        # What cannot be measured is null, and so is the seed of an average over several.
+            raise ValueError(f"it has an unknown column {name!r}") from None
+        # Null stands for a measure that could not be taken, and for the seed of a mean over several.
         null = "mean" in row if name == "seed" else form not in ("", "d") and name not in REQUIRED
         if not (_fits(value, form) or (null and value is None)):
             words = {"": "text", "d": "a whole number"}.get(form, "a finite number")
@@ -78,9 +78,9 @@ def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
             raise ValueError(f"it has no {', '.join(missing)}")
         won, played, outcomes = row["successes"], row["episodes"], row.get("outcomes")
         if not 0 <= won <= played or played < 1 or abs(row["success_rate"] - won / played) > 1e-9:
-            raise ValueError(f"{won} successes of {played} episodes are no rate of {row['success_rate']}")
+            raise ValueError(f"{won} successes in {played} episodes are no rate of {row['success_rate']}")
         if outcomes is not None and sorted(outcomes) != ["0"] * (played - won) + ["1"] * won:
-            raise ValueError(f"outcomes are not those of {won} successes in {played} episodes: {outcomes!r}")
+            raise ValueError(f"outcomes {outcomes!r} do not have {won} successes in {played} episodes")
 
 
 def _fits(value: Any, form: str) -> bool:

@@ -1,4 +1,4 @@
-"""This module measures how far a source is from demonstrations, and from what its policy then does."""
+"""Distances of a source from demonstrated actions, and from its policy's predictions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, jud
 
 @dataclass(frozen=True)
 class MeanError:
-    """Root mean squares over warm positions, inside the episode, are the error; NaN without a mean.
+    """Root mean square errors of a source's mean over warm positions inside the episode; NaN without any.
 
     Attributes:
         target: distance of the mean from the demonstrated actions.
@@ -42,8 +42,8 @@ def mean_error(
 
     Args:
         policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior, with the mean at deployment
-            (:meth:`SharedObservations.deployed`); WP-Preview's training mean has no error.
+        windows: ``[*B]`` of the policy's own prior, with the history of deployment
+            (:meth:`SharedObservations.deployed`); in training WP-Preview's mean is the target itself.
         nfe: network evaluations of the prediction; the policy's own by default.
 
     Raises:
@@ -72,7 +72,7 @@ def mean_error(
 def mean_revision(rollout: TensorDictBase) -> float:
     """Measure the distance of the mean from the policy's next prediction, along rollouts.
 
-    If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the
+    If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts are worse in the
     states that the policy reaches than in the demonstrations.
 
     Args:
@@ -115,10 +115,10 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
         policy: the policy, whose prior gives the source (:meth:`Prior.distribution`).
         windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.met`; held-out ones for a
             learned source.
-        level: of the interval :math:`\mu \pm z s`.
+        level: probability of the interval :math:`\mu \pm z s`.
 
     Returns:
-        Over the executed positions inside the episode; NaN for sources that are not Gaussian.
+        The share over executed positions inside the episode; NaN for sources that are not Gaussian.
 
     Raises:
         KeyError: if the windows lack a key.

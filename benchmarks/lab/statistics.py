@@ -1,4 +1,4 @@
-"""Statistics of a report: which rate is larger, and intervals of ratios."""
+"""Statistics of a report: comparisons of success rates, and intervals of ratios."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torch import Tensor
 from warmprior.diagnostics import success_posterior
 
 RESAMPLES = 2_000
-"""Of a bootstrap."""
+"""Number of draws of a bootstrap."""
 
 
 GRID = np.linspace(0.0, 1.0, 20_001)
-""":func:`probability_better` integrates over these rates."""
+"""Success rates over which :func:`probability_better` integrates."""
 
 
 def probability_better(successes_a: float, episodes_a: int, successes_b: float, episodes_b: int) -> float:
     r"""Return the probability that ``a`` succeeds more often than ``b``, both under a uniform prior.
 
-    With :math:`p_a \sim \mathrm{Beta}(\alpha_a, \beta_a)` and likewise :math:`p_b`, as in
+    With :math:`p_a \sim \mathrm{Beta}(\alpha_a, \beta_a)` and the same for :math:`p_b`, as in
     :func:`~warmprior.diagnostics.success_posterior`, it is :math:`\int f_a(x) F_b(x) \, dx`. Successes may be
     means over several checkpoints that played the same episodes. Pooled episodes of several training seeds
     are not quite independent; the probability is then too extreme.
@@ -38,10 +38,10 @@ def probability_better(successes_a: float, episodes_a: int, successes_b: float, 
 
 
 def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
-    """Return the episodes of the best setting, which is chosen on other episodes than those it is counted on.
+    """Return the outcomes of the best setting, chosen on other episodes than those that are returned.
 
-    Of outcomes ``[settings, episodes]`` the even episodes choose for the odd ones and the odd for the even
-    ones; among equals the first setting is chosen. So no setting is better for having been chosen.
+    Outcomes are ``[settings, episodes]``. The even episodes choose the setting of the odd ones and vice
+    versa; among equals the first setting is chosen. So the choice does not bias the success rate.
 
     Examples:
         >>> import numpy as np
@@ -60,12 +60,13 @@ def resampled_means(tasks: Sequence[tuple[Sequence[int], int]], rng: np.random.G
     """Return bootstrap draws of a mean success rate over tasks, ``[RESAMPLES]``.
 
     A draw takes training seeds with replacement, task by task, and then episodes of each. Every task has the
-    same weight. With several seeds the draws spread somewhat too far, because the rates of seeds vary with
-    their episodes already; with one seed they spread too little, because they leave out how seeds differ.
+    same weight. With several seeds the draws spread somewhat too far, because the rates of seeds already
+    contain the chance of their episodes; with one seed they spread too little, because differences between
+    seeds are left out.
     rliable (Agarwal et al. 2021) resamples seeds in the same way, but not episodes.
 
     Args:
-        tasks: the episodes that each training seed solved, and how many each of them played.
+        tasks: per task the number of episodes that each training seed solved, and that each played.
         rng: source of randomness.
 
     Examples:
@@ -95,7 +96,7 @@ def paired_probability_better(wins: float, losses: float) -> float:
     the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes of the
     same seeds differ in difficulty.
 
-    Of several checkpoints that played the same episodes, an episode counts once, by the mean of its outcomes.
+    If several checkpoints played the same episodes, an episode counts once, with the mean of its outcomes.
 
     Examples:
         >>> from lab.statistics import paired_probability_better
@@ -112,20 +113,20 @@ def bootstrap_ratio(
     *,
     generator: torch.Generator | None = None,
 ) -> tuple[float, float, float]:
-    """Ratio of two means over the same observations, with a percentile bootstrap interval of 95%.
+    """Return the ratio of two means over the same observations, with a 95% percentile bootstrap interval.
 
-    It draws whole groups with replacement: neighbouring steps of an episode are alike, and intervals from
-    single steps would be far too narrow. Observations where either value is NaN do not count.
+    It draws whole groups with replacement, because neighbouring steps of an episode are similar and intervals
+    from single steps would be far too narrow. Observations where either value is NaN are left out.
 
     Args:
         numerator: ``[n]``.
         denominator: ``[n]``, of the same observations.
-        groups: the group of each, int64 ``[n]``; its episode, usually.
+        groups: the group of each observation, usually its episode, int64 ``[n]``.
         generator: source of randomness on the CPU; PyTorch's global one by default.
 
     Returns:
-        The ratio, the lower and the upper end of its interval; NaN if nothing counts, and a NaN interval for
-        a single group.
+        The ratio, and the lower and upper end of its interval. All are NaN without observations; the interval
+        is NaN for a single group.
 
     Raises:
         ValueError: if the shapes differ.

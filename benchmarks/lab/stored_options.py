@@ -1,4 +1,4 @@
-"""The options of runs that were started before: how they are recorded, read and compared."""
+"""The options of earlier runs: how they are recorded, read and compared."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lab.tasks import (
 from warmprior.io.files import read_json
 
 OF_A_START = ("out", "resume", "envs", "videos", "logger", "engine", "ray_address")
-"""Options of a run that may differ each time it is started: they change no result."""
+"""Options that may differ each time a run is started, because they change no result."""
 
 
 def recorded(options: Options) -> dict[str, Any]:
-    """Options as JSON holds them, without those of a start."""
-    # A path is that of the same file from another working directory.
+    """Return options as JSON, without those that may differ each time a run is started."""
+    # Paths are absolute, so that a run can be resumed from another working directory.
     tree: dict[str, Any] = json.loads(json.dumps(asdict(options), default=resolved_place))
     for name in OF_A_START:
         del tree["run"][name]
@@ -30,55 +30,58 @@ def recorded(options: Options) -> dict[str, Any]:
     return tree
 
 
-_ABSENT = object()  # no option is this
+_ABSENT = object()  # unequal to every option
 
 
-def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
-    """The options in which two records differ."""
-    for name in mine.keys() | theirs.keys():
-        one, two = mine.get(name, _ABSENT), theirs.get(name, _ABSENT)
-        if isinstance(one, dict) and isinstance(two, dict):
-            yield from differences(one, two)
-        elif one != two:
+def differences(one: Mapping[str, Any], two: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the options in which two records differ."""
+    for name in one.keys() | two.keys():
+        first, second = one.get(name, _ABSENT), two.get(name, _ABSENT)
+        if isinstance(first, dict) and isinstance(second, dict):
+            yield from differences(first, second)
+        elif first != second:
             yield "--run" if name == "policies" else "--" + name.replace("_", "-")
 
 
-def check_same(one: Options, two: Options, said: str, otherwise: str) -> None:
-    """Refuse options that differ where a run has its own."""
+def check_same(one: Options, two: Options, reason: str, alternative: str) -> None:
+    """Raise ValueError, naming the options, if two sets of options differ."""
     if changed := sorted(set(differences(recorded(one), recorded(two)))):
-        raise ValueError(f"{said} {', '.join(changed)}: leave these out, or {otherwise}")
+        raise ValueError(f"{reason} {', '.join(changed)}: leave these out, or {alternative}")
 
 
 def of_run(options: Options, run: Path) -> Options:
-    """The options of a finished run, with those of its tasks, styles, chunks and methods that are asked for.
+    """Return the options of a finished run, for the tasks, styles, chunks and methods that are asked for.
 
-    Whatever else determines its policies has to be as in the run.
+    All other options that determine its policies must equal the run's.
+
+    Raises:
+        ValueError: if one of them differs.
     """
     stored = stored_options(Options, run, None)
     some: dict[str, dict[str, Any]] = {"data": {}, "sources": {"prior": options.sources.prior}}
     for part, name in (("data", "task"), ("data", "data"), ("sources", "chunk")):
-        asked = getattr(getattr(options, part), name)
-        if {*asked} <= {*getattr(getattr(stored, part), name)}:
-            some[part][name] = asked
+        typed = getattr(getattr(options, part), name)
+        if {*typed} <= {*getattr(getattr(stored, part), name)}:
+            some[part][name] = typed
     stored = with_parts(stored, **some)
-    theirs: Any = {part: getattr(stored, part) for part in ("data", "network", "training", "sources")}
-    same = with_parts(options, **theirs, run={"compile": stored.run.compile})
+    stored_parts: Any = {part: getattr(stored, part) for part in ("data", "network", "training", "sources")}
+    same = with_parts(options, **stored_parts, run={"compile": stored.run.compile})
     check_same(same, options, f"--run {run} has its own", "leave out --run")
     return with_parts(stored, run={"out": run})
 
 
 def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O:
-    """The options of the run in a folder: of one study, or what any study shares."""
+    """Return the options of the run in a folder; without a study, only those that all studies share."""
     path = out / "options.json"
     if not path.is_file():
         raise ValueError(f"there is no run in {out}: name its folder")
     stored = read_json(path)
     if not isinstance(stored, dict):
         raise ValueError(f"{path} is damaged: it is no JSON object")
-    theirs = stored.get("study")
-    if study not in (None, theirs):
+    stored_study = stored.get("study")
+    if study not in (None, stored_study):
         raise ValueError(
-            f"{path} holds a run of {theirs}: continue it with that script, or choose another --out"
+            f"{path} holds a run of {stored_study}: continue it with that script, or choose another --out"
         )
     tree: Any = stored.get("options")
     if study is None and isinstance(tree, dict):
@@ -98,12 +101,12 @@ def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O
 
 
 def from_record[O: Options](kind: type[O], tree: Any) -> O:
-    """The inverse of :func:`recorded`; a value of another type is refused."""
+    """Invert :func:`recorded`; raise ValueError for a value of another type."""
     return TypeAdapter(kind).validate_json(json.dumps(tree), strict=True)
 
 
-def check_typed(stored: Options, out: Path, known: Sequence[str]) -> None:
-    """What a file says is not imported: only what was typed, or what the script itself takes."""
+def check_typed(stored: Options, out: Path, importable: Sequence[str]) -> None:
+    """Raise ValueError if stored options name a class that may not be imported."""
     for name in (*stored.sources.prior, *stored.data.task):
-        if ":" in name and name not in known:
+        if ":" in name and name not in importable:
             raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")

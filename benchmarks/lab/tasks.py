@@ -1,4 +1,4 @@
-"""Tasks of the benchmarks, and where their demonstrations come from."""
+"""Tasks of the benchmarks, and the sources of their demonstrations."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from warmprior.training.files import image_names, opened, read_steps, task_name
 from warmprior.training.options import PRETRAINED
 
 GENERATED = 150
-"""Scripted demonstrations, where no other number is asked for."""
+"""Default number of scripted demonstrations."""
 
 
 MOST = 10_000_000
-"""No count may be larger: more could neither be listed nor done."""
+"""Upper limit of every count, which catches typing errors before memory is full."""
 
 
 def is_simulated(task: str) -> bool:
-    """Whether a task is one of robosuite: not the toy, and not one of a user's own."""
+    """Return True for robosuite's tasks, which are neither the toy nor a user's own."""
     return task != "navigation" and ":" not in task
 
 
 def check_counts(options: Any, *names: str) -> None:
-    """Refuse options of a dataclass that are no whole numbers from 1 to MOST; ``None`` is fine."""
+    """Raise ValueError for options that are neither ``None`` nor whole numbers from 1 to MOST."""
     for name in names:
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         for count in value if isinstance(value, tuple) else (value,):
@@ -57,10 +57,13 @@ def check_counts(options: Any, *names: str) -> None:
 
 
 def check_place(place: str | Path, option: str) -> None:
-    """Refuse a place where there can be no demonstrations; nothing is read or fetched.
+    """Check that a place may hold demonstrations; nothing is read or downloaded.
 
-    A place is an HDF5 file, ``lerobot:`` and a folder or repository, or ``minari:`` and a name; errors name
-    it by the option.
+    A place is an HDF5 file, ``lerobot:`` and a folder or repository, or ``minari:`` and a name.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder; it names the option.
+        ImportError: if the package that reads it is not installed.
 
     Examples:
         >>> from lab.tasks import check_place
@@ -86,7 +89,7 @@ def check_place(place: str | Path, option: str) -> None:
 
 
 def resolved_place(place: Path) -> str:
-    """The same place as seen from any working directory."""
+    """Return a place with an absolute path, so that it holds in any working directory."""
     if dataset_name(place, MINARI) is not None:
         return str(place)
     dataset = dataset_name(place, LEROBOT)
@@ -97,26 +100,26 @@ def resolved_place(place: Path) -> str:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """What policies are trained on.
+    """Options of the demonstrations that policies are trained on.
 
     Attributes:
-        task: manipulation tasks (default: square, or the dataset's); or one of your own, as
-            package.module:function, which is given these options and returns a Task.
-        data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
-            the source).
-        dataset: a robomimic HDF5 file, a LeRobotDataset (lerobot:FOLDER, or lerobot:USER/NAME of the hub), or
-            a Minari dataset (minari:NAME). Instead of generated data.
-        download: fetch the official files from the hub instead.
-        force_download: fetch them again, in place of a broken local copy.
-        mask: name of a mask in the file, such as train; only its demonstrations are used.
-        time_limit: control steps per episode (default: the environment's own, or robosuite's for ph or mh).
-        demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
-            numbers for ph and mh.
-        actions: what policies predict: pose deltas as recorded, or the absolute poses that they ask for.
-        obs: what policies see: the state of robot and objects, or that of the robot and images.
-        cameras: of the images; by default the task's two, or four with two arms.
-        image_size: side of the images in pixels.
-        fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
+        task: tasks of robosuite (default: square, or the dataset's), or package.module:function of your own,
+            which takes these options and returns a Task
+        data: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
+            source (human) or core (generated from source)
+        dataset: demonstrations in place of generated ones: a robomimic HDF5 file, lerobot:FOLDER or
+            lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
+        download: download the official demonstrations, in place of generated ones
+        force_download: download the official demonstrations again, in place of a broken local copy
+        mask: mask of the file, such as train, whose demonstrations to use (default: all)
+        time_limit: control steps per episode (default: the environment's own, or robosuite's for the style)
+        demonstrations: number of demonstrations to generate, or to take from a file (default: all of it); two
+            numbers for ph and mh
+        actions: actions of the policies: deltas as recorded, or the absolute poses that they target
+        obs: observations of the policies: state of robot and objects, or state of the robot and images
+        cameras: cameras of the images (default: the task's two, or four with two arms)
+        image_size: side of the images in pixels
+        fast_rendering: render without reflections, shadows and smooth edges, three to five times faster
 
     Examples:
         >>> from lab.tasks import DataOptions
@@ -147,12 +150,12 @@ class DataOptions:
             )
 
     def check(self) -> None:
-        """Refuse options that cannot work, naming them, before anything is generated or downloaded.
+        """Check the options before anything is generated or downloaded.
 
         Raises:
             ValueError: for options that contradict each other.
             FileNotFoundError: if the file does not exist.
-            ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
+            ImportError: if MimicGen's data are to be downloaded, but its package is not installed.
         """
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
@@ -196,20 +199,20 @@ class DataOptions:
 
     @property
     def generated(self) -> bool:
-        """Whether scripted experts make the data."""
+        """Return True if scripted experts generate the data."""
         return self.dataset is None and not self.download
 
     def first(self, style: str) -> int | None:
-        """Demonstrations to take of a file of a style; ``None`` for all of it."""
+        """Return the number of demonstrations to take from a file of a style; ``None`` for all."""
         return self.demonstrations[-1 if style == "mh" else 0] if self.demonstrations else None
 
     def count(self, style: str) -> int:
-        """Scripted demonstrations of a style."""
+        """Return the number of scripted demonstrations of a style."""
         return self.first(style) or GENERATED
 
 
 def check_network(network: NetworkOptions, data: DataOptions) -> None:
-    """Refuse options of images that cannot work, or have no effect, and weights that cannot be had."""
+    """Raise an error for options of images that do not fit, and for pretrained weights that are missing."""
     if data.obs == "state":
         usual = network.without_images() == network or network.encoder == "resnet18"
         if not usual or data.image_size != DataOptions().image_size:
@@ -228,11 +231,11 @@ def check_network(network: NetworkOptions, data: DataOptions) -> None:
 def robosuite_task(
     path: Path | str, style: str, *, source: str, observation_steps: int, options: DataOptions
 ) -> Task:
-    """The task of a file of demonstrations, made as ``source`` says: scripted, official or file."""
-    # A generated file has as many as were asked for, and what is no file given is of the task asked for.
+    """Return the task of a file of demonstrations; ``source`` is scripted, official or file."""
+    # Only a file of the user's may have too many demonstrations, or be of an unknown task.
     demos = None if source == "scripted" else options.first(style)
     named = next(iter(options.task), None) if source == "file" else None
-    seen: dict[str, Any] = {}
+    image_options: dict[str, Any] = {}
     place = path
     if options.obs == "image":
         index = opened(path, named, options.mask).index(demos=demos)
@@ -241,7 +244,7 @@ def robosuite_task(
             raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
         size, fast = options.image_size, options.fast_rendering
         place = with_images(path, named, cameras, size, fast, demos=demos, mask=options.mask)
-        seen = {"image_keys": image_names(cameras), "fast_rendering": fast}
+        image_options = {"image_keys": image_names(cameras), "fast_rendering": fast}
     task = Task.open(
         place,
         task=named,
@@ -251,7 +254,7 @@ def robosuite_task(
         mask=options.mask,
         demos=demos,
         horizon=options.time_limit,
-        **seen,
+        **image_options,
     )
     if task.environment is None:
         raise ValueError(
@@ -262,7 +265,7 @@ def robosuite_task(
     if "gymnasium" in task.environment:
         return task
     facts, digest = task.facts | {"source": source}, task.digest
-    if place != path:  # of what it was rendered from
+    if place != path:  # the facts are those of the original file
         original = opened(path)
         facts |= {"file": original.name, "sha256": original.digest()}
         digest = digest_of(facts["sha256"], demos, space_of(task), facts["images"], renderer_versions())
@@ -279,19 +282,19 @@ def with_images(
     demos: int | None = None,
     mask: str | None = None,
 ) -> Path | str:
-    """A place whose demonstrations have images of some cameras: this one, or a file rendered from it."""
-    found = opened(place, task, mask)
-    index = found.index(demos=demos)
+    """Return a place whose demonstrations have images: the given one, or a file rendered from it."""
+    opened_place = opened(place, task, mask)
+    index = opened_place.index(demos=demos)
     if set(cameras) <= set(index.cameras):
-        there = found.index(image_keys=image_names(cameras), demos=demos).image_size
-        if there != size:
+        stored_size = opened_place.index(image_keys=image_names(cameras), demos=demos).image_size
+        if stored_size != size:
             raise ValueError(
-                f"{index.path} has images of {there} pixels: add --image-size {there} (and a --crop-size "
-                "below), or render it anew"
+                f"{index.path} has images of {stored_size} pixels: add --image-size {stored_size} (and a "
+                "smaller --crop-size), or render it again"
             )
         return place
     if str(place).startswith(LEROBOT):
-        return place  # whoever reads it says what is missing
+        return place  # its reader names the missing cameras
     if mask is not None:
         raise ValueError(
             f"{place} has no images of {', '.join(cameras)}, and files are rendered whole: render it first "
@@ -303,26 +306,29 @@ def with_images(
 def read_like(
     place: Path | str, name: str, facts: Mapping[str, Any], mask: str | None = None
 ) -> tuple[TensorDictBase, str]:
-    """Further demonstrations of a task in robosuite, in raw units, as policies of these facts see them.
+    """Return more demonstrations of a robosuite task in raw units, and the name of their place in results.
 
-    Also what the place is called in results. A ``ValueError`` if they are of another task.
+    Their observations and actions are those of the policies with these facts.
+
+    Raises:
+        ValueError: if the demonstrations are of another task.
     """
-    found = opened(place, name, mask)
-    if (theirs := task_name(found.index())) != name:  # before images are rendered
-        raise ValueError(f"{place} holds demonstrations of {theirs}, but these policies are for {name}")
-    images, called = facts.get("images"), found.name
-    seen: dict[str, Any] = {"absolute_actions": facts.get("actions") == "absolute"}
+    opened_place = opened(place, name, mask)
+    if (stored := task_name(opened_place.index())) != name:  # before images are rendered
+        raise ValueError(f"{place} has demonstrations of {stored}, but the policies are for {name}")
+    images, called = facts.get("images"), opened_place.name
+    space: dict[str, Any] = {"absolute_actions": facts.get("actions") == "absolute"}
     if images is not None:
         place = with_images(
             place, name, images["cameras"], images["size"], images["fast_rendering"], mask=mask
         )
-        found = opened(place, name, mask)
-        seen |= {"cameras": images["cameras"], "fast_rendering": images["fast_rendering"]}
-    return read_steps(found, **seen)[0].data.exclude("next"), called
+        opened_place = opened(place, name, mask)
+        space |= {"cameras": images["cameras"], "fast_rendering": images["fast_rendering"]}
+    return read_steps(opened_place, **space)[0].data.exclude("next"), called
 
 
 def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
-    """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
+    """Return the task of the navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
 
     In the style ``"position"`` policies see the position alone, as in the paper.
 
@@ -343,10 +349,10 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
     """Read, download or generate the demonstrations of one task.
 
     Args:
-        options: where they come from, and what policies are to see of them.
-        name: of a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
-            which may take the options; ``None`` for that of ``options.dataset``.
-        style: of the demonstrations.
+        options: the source of the demonstrations, and the observations of the policies.
+        name: a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
+            which may take the options; ``None`` for the task of ``options.dataset``.
+        style: style of the demonstrations.
         observation_steps: ``To`` of the policies.
 
     Raises:
@@ -374,7 +380,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 
 
 def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
-    """The file or dataset of a robosuite task, downloaded or generated if needed, and what made it."""
+    """Return the file or dataset of a robosuite task, and its source; download or generate it if needed."""
     if options.dataset is not None:
         return options.dataset, "file"
     if options.download:
@@ -383,37 +389,37 @@ def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tup
 
 
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
-    """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style."""
+    """Check the options, and return name and style of each task, for :func:`load_task`."""
     options.check()
     names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
     if options.generated and any(name in TASKS for name in names):
         counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
         print(
-            f"Data: {counts} scripted demonstrations per task. They stand in for the official human data "
-            "(--download); success rates on them are not comparable with the paper's.",
+            f"Data: {counts} scripted demonstrations per task, in place of the official human ones "
+            "(--download). Success rates on them are not comparable with the paper's.",
             flush=True,
         )
-    found: dict[tuple[str | None, str], None] = {}
+    places: dict[tuple[str | None, str], None] = {}
     for name in names:
         one_style = name is not None and not is_simulated(name)
         styles = options.data[: 1 if one_style else None]
         if options.download and name in TASKS:
-            there = tuple(style for style in styles if style in OFFICIAL.get(name, ()))
-            if there and there != styles:
-                left_out = ", ".join(style for style in styles if style not in there)
+            published = tuple(style for style in styles if style in OFFICIAL.get(name, ()))
+            if published and published != styles:
+                left_out = ", ".join(style for style in styles if style not in published)
                 print(f"Data: there are no official {left_out} demonstrations of {name}.", flush=True)
-                styles = there
-        found |= dict.fromkeys((name, style) for style in styles)
-    return list(found)
+                styles = published
+        places |= dict.fromkeys((name, style) for style in styles)
+    return list(places)
 
 
 def space_of(task: Task) -> dict[str, str]:
-    """Return the spaces of actions and observations, where they are not the recorded one and the state."""
+    """Return the spaces of actions and observations, if they are not recorded deltas and the state."""
     return {key: task.facts[key] for key in ("actions", "obs") if key in task.facts}
 
 
 def title_of(task: Task) -> str:
-    """Return task, style and what is unusual, for figures.
+    """Return task, style and unusual spaces, for titles of figures.
 
     >>> title_of(load_task(DataOptions(), "navigation"))
     'navigation toy'

@@ -1,4 +1,4 @@
-"""How speed is measured: a clock for several things in turn, and random data of a robot's size."""
+"""Measurement of speed: a clock for several functions in turn, and random data of a robot's size."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ NFES = (1, 3, 9)
 
 
 class Clock:
-    """Times several things in turn, so that the machine's drift meets all of them alike."""
+    """Times several functions in turn, so that drifts of the machine affect all of them equally."""
 
     def __init__(self, repeats: int, bar: tqdm) -> None:
         self.repeats, self.bar = repeats, bar
 
     def times(
-        self, *things: Callable[[], object], calls: int = 1, before: Callable[[], object] = int
+        self, *functions: Callable[[], object], calls: int = 1, before: Callable[[], object] = int
     ) -> list[list[float]]:
-        """Seconds per call, ``[thing][repeat]``; ``before`` runs untimed ahead of each round."""
-        found: list[list[float]] = [[] for _ in things]
+        """Return seconds per call, ``[function][repeat]``; ``before`` runs untimed before each round."""
+        seconds: list[list[float]] = [[] for _ in functions]
         for repeat in range(self.repeats + 1):
             before()
-            # Every other round runs backwards: neither is always the one after the other.
-            for i in range(len(things)) if repeat % 2 else reversed(range(len(things))):
+            # Every other round runs backwards, so that no function is always first.
+            for i in range(len(functions)) if repeat % 2 else reversed(range(len(functions))):
                 start = time.perf_counter()
                 for _ in range(calls):
-                    things[i]()
+                    functions[i]()
                     if torch.cuda.is_initialized():
                         torch.cuda.synchronize()
                 if repeat:  # the first round warms up
-                    found[i].append((time.perf_counter() - start) / calls)
+                    seconds[i].append((time.perf_counter() - start) / calls)
             self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")
-        return found
+        return seconds
 
-    def ratio(self, thing: Callable[[], object], base: Callable[[], object], **options: Any) -> float:
-        """Median of the rounds' time of ``thing`` over that of ``base``."""
-        one, two = self.times(thing, base, **options)
+    def ratio(self, function: Callable[[], object], base: Callable[[], object], **options: Any) -> float:
+        """Return the median over rounds of the time of ``function`` over that of ``base``."""
+        one, two = self.times(function, base, **options)
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
 
 
 def steps(episodes: int, length: int) -> TensorDict:
-    """Demonstrations of random numbers."""
+    """Return demonstrations of random numbers."""
     n = episodes * length
     both = torch.rand(n, D_O + D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
     observation, action = both.split((D_O, D_A), dim=-1)
@@ -60,6 +60,6 @@ def steps(episodes: int, length: int) -> TensorDict:
 
 
 def one_decision(device: str = "cpu") -> TensorDict:
-    """What a policy is given for one decision."""
+    """Return the input of a policy for one decision."""
     history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     return TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)

@@ -16,25 +16,25 @@ from warmprior.io.workers import worker_died
 
 
 def available_cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 _states: dict[str, Any] = {}
-"""Of this process: what jobs of :func:`working` work on."""
+"""States of :func:`working` in this process, by name."""
 
 
 def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
-    """A loky executor whose processes compute with one thread each, and end when this process ends.
+    """Return a loky executor whose processes compute with one thread each, and end with this process.
 
-    They are no forks: nothing of this process is in them. Ctrl-C is left to this process.
+    They are not forked, and ignore Ctrl-C.
     """
 
     def begin(parent: int) -> None:
-        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the other
-        # one imports this library, which takes seconds.
+        # A local function is sent by value, so it runs before the process imports this library, which takes
+        # seconds: Ctrl-C and the end of this process are handled from the start.
         import os
         import signal
         import sys
@@ -48,7 +48,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
         threading.Thread(target=watch, daemon=True).start()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
+        # Processes cache data such as demonstrations; loky must not restart them for a memory leak.
         loky: Any = sys.modules["loky.process_executor"]
         loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
 
@@ -60,9 +60,12 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
 @contextmanager
 def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]], Future[Any]]]:
-    """Processes that each hold a copy of a state; yields what submits ``job(state)``, both picklable.
+    """Start processes with a copy of a state each; yield a function that submits ``job(state)``.
 
-    Leaving the context with an error ends all of them at once. A ``WorkerError`` if a process dies.
+    State and jobs have to be picklable. An error in the context ends all processes at once.
+
+    Raises:
+        WorkerError: if a process dies.
     """
     executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
     try:
@@ -71,7 +74,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
         executor.shutdown(kill_workers=True)
         if isinstance(error, BrokenProcessPool):
             worker = f"one of {count} workers"
-            raise worker_died(worker, "see above for its own error") from error
+            raise worker_died(worker, "see its own error above") from error
         raise
     executor.shutdown()
 

@@ -1,1 +1,1 @@
-"""Scripted experts that generate demonstrations where no official data are at hand."""
+"""Scripted experts that generate demonstrations in place of official ones."""

@@ -1,4 +1,4 @@
-"""One scripted demonstration, which follows from its task, style and seed, and the files of many."""
+"""Scripted demonstrations, determined by task, style and seed, and their files."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _HOLD = 6  # steps that the task must stay solved for before the episode ends
 class Episode:
     """A recorded demonstration of ``N`` steps.
 
-    ``actions`` ``[N, d_a]`` in ``[-1, 1]``; ``states`` ``[N, 1 + nq + nv]``, the simulator before each;
-    ``rewards`` ``[N]``, 1 where the action led to a solved state; ``observations`` ``[N + 1, ...]`` by name,
-    the last row after the last action. All are float64.
+    ``actions`` are ``[N, d_a]`` in ``[-1, 1]``; ``states`` are the simulator's before each action, ``[N, 1 +
+    nq + nv]``; ``rewards`` are 1 if the action led to a solved state, ``[N]``; ``observations`` are ``[N + 1,
+    ...]`` by name, the last row after the last action. All are float64.
     """
 
     seed: int
@@ -50,7 +50,7 @@ def expert_loop(task: str) -> ControlLoop:
 
 
 def operator_of(style: str, seed: int) -> int:
-    """Index of the operator who plays a seed: they take turns in ``mh`` data."""
+    """Return the index of the operator who plays a seed; in ``mh`` data operators take turns."""
     return seed % len(OPERATORS) if style == "mh" else 0
 
 
@@ -66,7 +66,7 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
 
     index = operator_of(style, seed)
     operator = OPERATORS[index] if style == "mh" else SKILLED
-    # The first number keeps this stream apart from others that are seeded with the same integer.
+    # The first number separates this stream from others with the same seed.
     person = Demonstrator(operator, np.random.default_rng([7919, seed]))
     observations = [observe(loop.reset(seed))]
     runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(EXPERTS[task](loop, person))]
@@ -107,9 +107,9 @@ def write_robomimic(
     seed: int = 0,
     attributes: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write episodes, one by one, to a file that robomimic's own reader opens; how many samples it has.
+    """Write episodes to a file that robomimic's reader opens, and return its number of samples.
 
-    The seed is that of the random split into filter keys, ``model_file`` the simulator's XML.
+    ``seed`` seeds the random split into filter keys; ``model_file`` is the simulator's XML.
     """
     h5py = require("h5py", "sim")
     steps: list[int] = []
@@ -164,12 +164,12 @@ def _filter_keys(levels: list[str], rng: np.random.Generator) -> dict[str, set[i
         size = max(1, count * percentage // 100)
         subsets[f"{percentage}_percent"] = set(rng.permutation(count)[:size].tolist())
     if len(set(levels)) > 1:
-        of = {name: {i for i in everything if levels[i] == name} for name in LEVELS}
-        subsets |= of
+        by_level = {name: {i for i in everything if levels[i] == name} for name in LEVELS}
+        subsets |= by_level
         for first, second in (("okay", "better"), ("worse", "okay"), ("worse", "better")):
-            subsets[f"{first}_{second}"] = of[first] | of[second]
-    found = dict(splits)
+            subsets[f"{first}_{second}"] = by_level[first] | by_level[second]
+    keys = dict(splits)
     for name, demos in subsets.items():
-        found[name] = demos
-        found |= {f"{name}_{split}": demos & members for split, members in splits.items()}
-    return {name: demos for name, demos in found.items() if demos}
+        keys[name] = demos
+        keys |= {f"{name}_{split}": demos & members for split, members in splits.items()}
+    return {name: demos for name, demos in keys.items() if demos}

@@ -1,4 +1,4 @@
-"""Generates demonstration files from the scripted experts, in parallel and reproducibly."""
+"""Demonstration files from the scripted experts, generated in parallel and reproducibly."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
 
-#: Part of every cached file's name; raised whenever the same arguments give other demonstrations.
+#: Part of every cached file's name; raised when the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
-#: A file of ``seed`` uses the simulator seeds from ``seed * SEEDS_PER_FILE`` on, at most this many.
+#: The file of a ``seed`` uses at most this many simulator seeds, from ``seed * SEEDS_PER_FILE`` on.
 SEEDS_PER_FILE = 100_000
 _STYLES = ("ph", "mh")
 
@@ -39,9 +39,9 @@ def generate_demonstrations(
     overwrite: bool = False,
     workers: int | None = None,
 ) -> Path:
-    """Generate successful scripted demonstrations in robomimic's HDF5 layout; the path of the complete file.
+    """Generate successful scripted demonstrations in robomimic's HDF5 layout, and return the file's path.
 
-    Of states; :func:`lab.render.render_demonstrations` makes images of them.
+    The file has states; :func:`lab.render.render_demonstrations` renders images from them.
 
     Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
     kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
@@ -50,16 +50,16 @@ def generate_demonstrations(
 
     Args:
         task: ``lift``, ``can``, ``square``, ``stack`` or ``transport``.
-        style: ``"ph"`` for one skilled operator, ``"mh"`` for six of three levels.
+        style: ``"ph"`` for one skilled operator, ``"mh"`` for six operators with three levels of skill.
         n: number of demonstrations.
         seed: 0 to 99; files of different seeds share no episode.
-        path: where to write. ``None`` for the cache (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if
+        path: file to write. ``None`` for the cache (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if
             that is not set), from which a file generated earlier with the same arguments is returned at once.
-        overwrite: replace what is at ``path``.
+        overwrite: replace an existing file.
         workers: number of processes; ``None`` for one per available core.
 
     Raises:
-        FileExistsError: if there is something at ``path``.
+        FileExistsError: if ``path`` exists.
         ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
         RuntimeError: if the experts fail too often to reach ``n``.
 
@@ -80,7 +80,7 @@ def generate_demonstrations(
             "(download_robomimic, or --download)"
         )
     if style not in _STYLES:
-        raise ValueError(f"style is {' or '.join(map(repr, _STYLES))}, got {style!r}")
+        raise ValueError(f"style must be {' or '.join(map(repr, _STYLES))}, got {style!r}")
     last_seed = EVALUATION_SEED // SEEDS_PER_FILE - 1
     if not 0 <= seed <= last_seed:
         raise ValueError(f"seed must be between 0 and {last_seed}, got {seed}")
@@ -123,24 +123,26 @@ def _successes(
 ) -> Iterator[Episode]:
     """Yield the first ``n`` successes in seed order, the same number from each operator."""
     operators = len(OPERATORS) if style == "mh" else 1
-    wanted = [n // operators + (i < n % operators) for i in range(operators)]
+    remaining = [n // operators + (i < n % operators) for i in range(operators)]
     limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
     upcoming = iter(range(first, first + limit))
     running: deque[Future[Episode]] = deque()
     played = 0
-    while any(wanted):
+    while any(remaining):
         while len(running) < ahead:
-            # Whoever has contributed enough is skipped, which never changes what is kept.
-            following = next((s for s in upcoming if wanted[operator_of(style, s)]), None)
+            # Seeds of operators who have contributed enough are skipped, which does not change the result.
+            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
             if following is None:
                 break
             running.append(call(partial(_play, style=style, seed=following)))
         if not running:
-            raise RuntimeError(f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes")
+            raise RuntimeError(
+                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
+            )
         episode = running.popleft().result()
         played += 1
-        if episode.success and wanted[episode.operator]:
-            wanted[episode.operator] -= 1
+        if episode.success and remaining[episode.operator]:
+            remaining[episode.operator] -= 1
             report(1)
             yield episode
     logger.info(f"{n} demonstrations from {played} scripted episodes")
@@ -148,12 +150,12 @@ def _successes(
 
 @cache
 def _loop(task: str) -> ControlLoop:
-    """The simulation of a task, one per worker."""
+    """Return the simulation of a task, one per worker."""
     return expert_loop(task)
 
 
 def _model(task: str) -> str:
-    """The simulator's model as XML."""
+    """Return the simulator's model as XML."""
     return str(_loop(task).env.sim.model.get_xml())
 
 

@@ -1,4 +1,4 @@
-"""Rotations, waypoints, the runner that follows them, and the movements that every task is made of."""
+"""Rotations, waypoints, the runner that follows them, and the movements of the tasks."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
 
 
 def turn_z(yaw: float) -> np.ndarray:
-    """Rotation matrix ``[3, 3]`` about the vertical."""
+    """Return the rotation matrix ``[3, 3]`` about the vertical."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def down(yaw: float, tilt: float = 0.0, roll: float = 0.0) -> np.ndarray:
-    """Orientation ``[3, 3]`` of a gripper that points down, turned by ``yaw`` and slightly tilted."""
+    """Return the orientation ``[3, 3]`` of a gripper that points down, turned by ``yaw`` and tilted."""
     return turn_z(yaw) @ rotation_matrix(np.array([roll, tilt, 0.0])) @ _HOME
 
 
@@ -57,12 +57,12 @@ def wrap(angle: float) -> float:
 
 
 def yaw_of(matrix: np.ndarray) -> float:
-    """Heading of a body's x axis in the horizontal plane."""
+    """Return the heading of a body's x axis in the horizontal plane."""
     return np.arctan2(matrix[1, 0], matrix[0, 0])
 
 
 def nearest_yaw(yaw: float, home: float, period: float = np.pi) -> float:
-    """Among the yaws equivalent under a symmetry, the one closest to ``home``."""
+    """Return the yaw closest to ``home`` among those that are equivalent by symmetry."""
     return float(home + (yaw - home + period / 2) % period - period / 2)
 
 
@@ -75,11 +75,11 @@ Plan = Iterator["Waypoint"]
 
 @dataclass
 class Waypoint:
-    """A goal pose ``[3]`` and ``[3, 3]``, constant or read anew at every step, and how to get there.
+    """A goal pose ``[3]`` and ``[3, 3]``, constant or read at every step, and options of the way to it.
 
-    It is reached within ``tol`` metres and ``rtol`` radians, or by ``until``; the arm then stays for
-    ``dwell`` steps, and goes on after ``limit`` steps regardless. ``speed`` and ``noise`` are fractions of
-    the operator's.
+    It is reached within ``tol`` metres and ``rtol`` radians, or when ``until`` is true. The arm then stays
+    for ``dwell`` steps. After ``limit`` steps it goes on in any case. ``speed`` and ``noise`` are fractions
+    of the operator's.
     """
 
     pos: np.ndarray | Live
@@ -111,7 +111,7 @@ class ArmRunner:
 
     @property
     def given_up(self) -> bool:
-        """Whether the plan ended a while ago, so nothing more will happen."""
+        """Return True if the plan ended a while ago, so that nothing more will happen."""
         return self._finished and self._steps > self._waypoint.limit + 20
 
     def _start(self) -> None:
@@ -136,14 +136,14 @@ class ArmRunner:
                 move, turn = self._error()
         person, waypoint = self._person, self._waypoint
         cap = person.speed * waypoint.speed
-        # 1.3 of the error per step keeps the controller, which lags behind, at the wanted speed.
+        # 1.3 times the error per step gives the intended speed, because the controller lags behind.
         move = _limit(person.gain * move / 0.05 * 1.3, cap)
         turn = _limit(person.gain * turn / 0.5 * 1.3, 0.6 * cap)
-        wanted = np.concatenate((move, turn))
+        target = np.concatenate((move, turn))
         if self._pause > 0:
             self._pause -= 1
-            wanted *= 0.1
-        self._command += person.smoothing * (wanted - self._command)
+            target *= 0.1
+        self._command += person.smoothing * (target - self._command)
         self._noise = 0.85 * self._noise + np.sqrt(1 - 0.85**2) * (
             person.rng.normal(size=6) * person.noise * waypoint.noise * _NOISE_SCALE
         )
@@ -175,7 +175,7 @@ def _limit(vector: np.ndarray, cap: float) -> np.ndarray:
 
 
 def above(loop: StepLoop, body: str, offset: Any = (0.0, 0.0, 0.0)) -> Live:
-    """Position of a body plus an offset in the world frame, read anew at every step."""
+    """Return a function that reads the position of a body plus an offset in the world frame."""
     shift = np.asarray(offset, dtype=np.float64)
     return lambda: loop.body(body)[0] + shift
 
@@ -193,7 +193,7 @@ def transfer(
 ) -> Plan:
     """Move along a curve, or axis by axis, through one intermediate waypoint.
 
-    ``turn`` is a signed yaw too large for the shortest rotation; half of it is done half-way.
+    ``turn`` is a signed yaw larger than half a turn; half of it is done at the intermediate waypoint.
     """
     start, start_mat = loop.eef(arm)
     end = _read(pos)
@@ -206,7 +206,7 @@ def transfer(
     left = np.array([-path[1], path[0], 0.0]) / (distance + 1e-6)
     way = way + left * person.arc * min(1.0, distance / 0.15)
     way[2] = max(way[2], min(start[2], end[2])) + lift
-    # A stretched arm is singular and does not come back: stay within reach.
+    # Stay within reach, because a stretched arm is singular and gets stuck.
     base = loop.body(f"robot{arm}_base")[0][:2]
     reach = max(0.68, float(np.linalg.norm(end[:2] - base)) - 0.03)
     way[:2] = base + (way[:2] - base) * min(1.0, reach / float(np.linalg.norm(way[:2] - base)))
@@ -220,7 +220,7 @@ def transfer(
 def carry(
     loop: StepLoop, arm: int, body: str, pose: Callable[[], tuple[np.ndarray, np.ndarray]]
 ) -> tuple[Live, Live]:
-    """Hand position and orientation that put a held body at ``pose()``, given the present grasp."""
+    """Return the hand position and orientation that put a held body at ``pose()``, by the present grasp."""
 
     def hand() -> tuple[np.ndarray, np.ndarray]:
         pos, mat = loop.eef(arm)
@@ -233,7 +233,7 @@ def carry(
 
 
 def bring(loop: StepLoop, arm: int, body: str, goal: Live) -> Live:
-    """Hand position that puts a held body at ``goal()``, whatever its orientation, for it may slip."""
+    """Return the hand position that puts a held body, which may slip, at ``goal()``."""
     return lambda: goal() + loop.eef(arm)[0] - loop.body(body)[0]
 
 
@@ -252,7 +252,7 @@ def grasp(
         yield Waypoint(pos() + slip, mat, OPEN, tol=0.015, dwell=stay, limit=60)
         yield Waypoint(over(hover), mat, OPEN, tol=0.02, limit=60)
     yield Waypoint(pos, mat, OPEN, tol=0.008, rtol=0.06, speed=0.6, noise=0.5, limit=70)
-    # The fingers need about ten steps to close; leaving earlier drops thin handles.
+    # The fingers need about ten steps to close; lifting earlier drops thin handles.
     stay = int(person.draw(9, 13))
     yield Waypoint(pos(), mat, CLOSED, ANY, ANY, dwell=stay, speed=0.3, noise=0.3)
 
@@ -285,10 +285,10 @@ def lower(loop: StepLoop, arm: int, body: str, goal: np.ndarray, mat: np.ndarray
 
 
 def is_raised(loop: StepLoop, body: str, height: float, by: float = 0.02) -> bool:
-    """Whether a body is more than ``by`` metres above a height."""
+    """Return True if a body is more than ``by`` metres above a height."""
     return bool(loop.body(body)[0][2] > height + by)
 
 
 def is_held(loop: StepLoop, arm: int, body: str, within: float = 0.12) -> bool:
-    """Whether a body is still near the hand, ``within`` metres."""
+    """Return True if a body is within ``within`` metres of the hand."""
     return bool(np.linalg.norm(loop.body(body)[0] - loop.eef(arm)[0]) < within)

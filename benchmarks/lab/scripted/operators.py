@@ -1,4 +1,4 @@
-"""Who demonstrates: one skilled style for ``ph`` data, six operators of three levels for ``mh``."""
+"""The operators of demonstrations: a skilled one for ``ph`` data, six with three levels for ``mh``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ LEVELS = ("better", "okay", "worse")
 class Operator:
     """The habits of one person.
 
-    ``speed`` is the largest command as a fraction of the full range, ``noise`` the scale of what is added.
-    ``pause`` and ``clumsy`` are the probabilities of hesitating before a waypoint, and of missing a grasp.
-    Transfers bulge by ``arc`` metres to the left, ``high`` metres higher than necessary, or go ``axiswise``.
-    Where there are two, ``side`` is preferred, and ``choice`` 0 takes the cheapest way, 1 the runner-up.
+    ``speed`` is the largest command as a fraction of the full range, ``noise`` the scale of the added noise.
+    ``pause`` and ``clumsy`` are the probabilities of pausing before a waypoint, and of missing a grasp.
+    Transfers bulge by ``arc`` metres to the left, rise ``high`` metres above the necessary height, or go
+    ``axiswise``. ``side`` is the preferred side; ``choice`` 0 takes the cheapest of several ways, 1 the
+    second.
     """
 
     level: str = "better"
@@ -45,7 +46,7 @@ OPERATORS = (
 
 
 class Demonstrator:
-    """An operator on one occasion: the habits, varied a little, and the randomness of the episode."""
+    """An operator in one episode: the habits with small variations, and the episode's random numbers."""
 
     def __init__(self, operator: Operator, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -63,10 +64,10 @@ class Demonstrator:
         return float(self.rng.uniform(low, high))
 
     def chance(self, probability: float) -> bool:
-        """Decide at random."""
+        """Return True with a probability."""
         return bool(self.rng.random() < probability)
 
     def pick[T](self, options: Sequence[T], cost: Callable[[T], float]) -> T:
-        """Choose by habit: the cheapest option, or the runner-up."""
+        """Choose by habit: the cheapest option, or the second cheapest."""
         ranked = sorted(options, key=cost)
         return ranked[min(self.choice, len(ranked) - 1)]

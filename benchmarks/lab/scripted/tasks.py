@@ -1,7 +1,7 @@
 """The experts: lift, can, square and stack with one arm, transport with two.
 
-A plan is a generator of waypoints that looks at the scene whenever it decides on the next one. A grasp that
-failed is noticed and repeated, up to four times.
+A plan is a generator of waypoints that reads the scene before each waypoint. A failed grasp is repeated, up
+to four times.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from lab.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
 _Attempt = Callable[[StepLoop, Demonstrator], Plan]
-_Expert = Callable[[StepLoop, Demonstrator], list[Plan]]  # a plan per arm, in a loop that was just reset
+_Expert = Callable[[StepLoop, Demonstrator], list[Plan]]  # a plan per arm, for a loop that was just reset
 _ATTEMPTS = 4
 _PEG = np.array([0.23, 0.1])
 _NUT = "SquareNut_main"
-_BASE_X = -0.56  # of the arm, in metres
+_BASE_X = -0.56  # position of the arm's base, in metres
 
 
 def _up(height: float) -> np.ndarray:
@@ -48,13 +48,13 @@ def _up(height: float) -> np.ndarray:
 
 
 def _grasp_yaws(yaw: float, period: float) -> list[float]:
-    """Equivalent finger directions within the wrist's comfortable range."""
+    """Return the equivalent finger directions within the wrist's comfortable range."""
     turns = [wrap(yaw + k * period) for k in range(round(2 * np.pi / period))]
     return [turn for turn in turns if -1.5 < turn < 2.2] or [min(turns, key=abs)]
 
 
 def _wrist_allows(yaw: float, pos: np.ndarray) -> bool:
-    """Whether joint 7 reaches a yaw (unwrapped, 0 at home) with the hand at ``pos``."""
+    """Return True if joint 7 reaches a yaw (unwrapped, 0 at home) with the hand at ``pos``."""
     return bool(-1.9 < yaw - np.arctan2(pos[1], pos[0] - _BASE_X) < 3.4)
 
 
@@ -111,8 +111,8 @@ def _try_square(loop: StepLoop, person: Demonstrator) -> Plan:
     """Put the square nut over the peg."""
     pos, mat = loop.body(_NUT)
     yaw = yaw_of(mat)
-    # The peg is so far out that the nut's handle must point towards the robot; the hand may then
-    # have either yaw. Pairs of yaws at the grasp and at the peg, within the wrist's range:
+    # The peg is so far away that the nut's handle must point towards the robot; the hand may have either
+    # yaw. These are pairs of yaws at the grasp and at the peg, within the wrist's range.
     pairs = [
         (start, end)
         for first, end in ((yaw - np.pi, 0.0), (yaw, np.pi))
@@ -181,17 +181,17 @@ _GIVER_YAW, _TAKER_YAW = np.pi / 2, -np.pi / 2
 
 
 def _transport(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Move the hammer from one table to the other: the giver's and the taker's plan.
+    """Return the plans of giver and taker, who move the hammer from one table to the other.
 
     The giver takes the lid off the start bin, takes the hammer out and offers it in the middle. The taker
-    clears the target bin, takes it over and puts it down there. They wait for one another through events.
+    clears the target bin, takes the hammer and puts it into the bin. They wait for each other by events.
     """
     events: set[str] = set()
     return [_giver(loop, person, events), _taker(loop, person, events)]
 
 
 def _handle(loop: StepLoop) -> np.ndarray:
-    """Direction ``[3]`` of the hammer's handle axis that points to the giver's side."""
+    """Return the direction ``[3]`` of the hammer's axis that points to the giver's side."""
     axis = loop.body(_HAMMER)[1][:, 2]
     return -axis if axis[1] > 0 else axis
 
