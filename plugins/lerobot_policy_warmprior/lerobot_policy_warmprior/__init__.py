@@ -1,4 +1,4 @@
-"""LeRobot finds this package by its name, and these policies by their types."""
+"""WarmPrior's policies for LeRobot, which finds this package by its name and the policies by their types."""
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig

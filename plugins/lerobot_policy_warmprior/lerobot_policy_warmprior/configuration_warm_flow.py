@@ -31,35 +31,35 @@ class WarmupRatioConfig(LRSchedulerConfig):
     warmup_ratio: float = 0.2
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """The schedule of a training of that many steps."""
+        """Make the schedule of a training with that many steps."""
         return warmup_cosine(optimizer, num_training_steps, self.warmup_ratio)
 
 
 @PreTrainedConfig.register_subclass("warm_flow")
 @dataclass
 class WarmFlowConfig(PreTrainedConfig):
-    """The paper's policy from state and images: a ChiTransformer that carries the prior's source to a chunk.
+    """Options of the paper's policy for states and images: a ChiTransformer with the source of a prior.
 
-    The recipe is the paper's (Table 3), but for the preconditioning, which `precondition=false` turns off.
+    The recipe is the paper's (Table 3), except for preconditioning, which `precondition=false` turns off.
 
     Attributes:
         n_obs_steps: ``To``, observations per decision.
         n_action_steps: actions executed per decision, at most ``H``.
-        prior_chunk: ``H``, the actions that the prior remembers; by default those that are executed.
-        prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
+        prior_chunk: ``H``, actions that the prior remembers; by default ``n_action_steps``.
+        prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
-        precondition: by the second moments of source and data, see PreconditionedNetwork.
-        ema_rate: decay of the averaged weights, which play.
+        precondition: precondition the network by the moments of source and data, see PreconditionedNetwork.
+        ema_rate: decay of the averaged weights, which are used at decisions.
         network: configuration of another velocity network, as JSON (``VelocityNetwork.config()``).
         embedding_dim: width of the transformer.
-        num_layers: its depth.
-        num_heads: its attention heads.
-        dropout: of its layers.
-        encoder: of images, a network per camera: ``resnet18-imagenet`` starts from ImageNet's weights, which
+        num_layers: number of layers of the transformer.
+        num_heads: number of attention heads of the transformer.
+        dropout: dropout of the transformer.
+        encoder: image encoder, one per camera: ``resnet18-imagenet`` starts from ImageNet's weights, which
             torchvision downloads once; ``resnet18`` and ``small`` start from random ones.
         image_size: side in pixels to which images are resized.
-        crop_size: side of their random window that is seen in training, the central one else.
+        crop_size: side in pixels of the crop, which is random in training and central at decisions.
     """
 
     n_obs_steps: int = 2
@@ -93,17 +93,17 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.prior_chunk is None:  # and it is saved: fewer can be executed later
+        if self.prior_chunk is None:  # saved as well, so that fewer actions can be executed later
             self.prior_chunk = self.n_action_steps
 
     def make_prior(self) -> Prior:
-        """The source distribution; a ``ValueError`` if there is none of that name and these options."""
+        """Make the source; a ``ValueError`` if the name or an option is unknown."""
         return build(
             registered(Prior, self.prior.partition(",")[0], OWN_PRIORS), self.prior, self.prior_chunk
         )
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
-        """Options without which saved weights mean something else; a training may change the source."""
+        """Return the options that saved weights depend on; a training may change the source."""
         names = "n_obs_steps precondition network embedding_dim num_layers num_heads image_size crop_size"
         return {
             **{name: getattr(self, name) for name in (*names.split(), "normalization_mapping")},
@@ -114,35 +114,36 @@ class WarmFlowConfig(PreTrainedConfig):
 
     @property
     def observed(self) -> list[str]:
-        """The observation's entries, in the order in which the network sees them: objects, then the robot."""
+        """Return the observation's entries in the network's order: objects, then the robot."""
         features = self.input_features.items()
         kinds = (FeatureType.ENV, FeatureType.STATE)
         return [name for kind in kinds for name, entry in features if entry.type is kind]
 
     def validate_features(self) -> None:
-        """Refuse, by a ``ValueError``, datasets that the policy cannot learn from."""
+        """Raise ValueError for a dataset that the policy cannot learn from."""
         encoders = ("resnet18-imagenet", "resnet18", "small")
         if self.encoder not in encoders:
             raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")
         mode = self.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
         if self.image_features and mode != NormalizationMode.IDENTITY:
             raise ValueError(
-                f"warm_flow scales pixels by itself: its VISUAL normalisation is IDENTITY, not {mode.value}"
+                f"warm_flow scales pixels by itself: set its VISUAL normalisation to IDENTITY, not to "
+                f"{mode.value}"
             )
         for name, feature in self.image_features.items():
             if feature.shape[0] != 3:
                 raise ValueError(
-                    f"warm_flow sees images [3, h, w], and {name} is {list(feature.shape)}: name "
-                    "--policy.input_features without it"
+                    f"warm_flow sees images [3, h, w], and {name} is {list(feature.shape)}: leave it out of "
+                    "--policy.input_features"
                 )
         if not self.observed:
-            raise ValueError("warm_flow needs observation.state or observation.environment_state")
+            raise ValueError("warm_flow needs observation.state or observation.environment_state: add one")
         if self.action_feature is None:
-            raise ValueError("warm_flow needs the feature 'action'")
+            raise ValueError("warm_flow needs the feature 'action': add it to the dataset")
         check_between(1, self.make_prior().chunk_length, n_action_steps=self.n_action_steps)
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """The paper's AdamW."""
+        """Return the paper's AdamW."""
         return AdamWConfig(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
@@ -151,21 +152,21 @@ class WarmFlowConfig(PreTrainedConfig):
         )
 
     def get_scheduler_preset(self) -> WarmupRatioConfig:
-        """The paper's warm-up and cosine."""
+        """Return the paper's warm-up and cosine."""
         return WarmupRatioConfig(warmup_ratio=self.scheduler_warmup_ratio)
 
     @property
     def observation_delta_indices(self) -> list[int]:
-        """Steps that LeRobot loads of every observation."""
+        """Return the steps of every observation that LeRobot loads."""
         return list(range(1 - self.n_obs_steps, 1))
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """Steps that LeRobot loads of every action: the history, and the chunk."""
+        """Return the steps of every action that LeRobot loads: the history, and the chunk."""
         prior = self.make_prior()
         return history_indices(prior.history_length, prior.prediction_length)
 
     @property
     def reward_delta_indices(self) -> None:
-        """None are loaded."""
+        """Return None, because no rewards are loaded."""
         return None

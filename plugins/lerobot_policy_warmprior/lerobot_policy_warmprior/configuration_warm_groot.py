@@ -13,4 +13,4 @@ from lerobot_policy_warmprior.configuration_warm_vla import WarmConfigMixin
 @PreTrainedConfig.register_subclass("warm_groot")
 @dataclass
 class WarmGrootConfig(WarmConfigMixin, GrootConfig):
-    """GR00T's options and those of the source."""
+    """GR00T's options, and those of the source."""

@@ -15,21 +15,22 @@ from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
 
 OWN_PRIORS = (
-    "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and beside --policy.path by "
+    "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and with --policy.path by "
     "--env.discover_packages_path=PACKAGE"
 )
-"""How a prior gets its name: the option is read from files too, and imports nothing."""
+"""Hint for unknown priors: names may come from files, so they never import anything."""
 
 
 @dataclass
 class WarmConfigMixin:
-    """Options of the source, beside those of the policy.
+    """Options of the source, in addition to those of the policy.
 
     Attributes:
-        prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
-        prior_chunk: ``H``, the actions that it remembers; by default as many as the chunk allows.
-        sigma_unit: what sigma is in units of: ``model`` (normalised actions) or ``std`` (deviations of data).
-        action_std: taken from the dataset for ``std``, and kept with the policy.
+        prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
+        prior_chunk: ``H``, actions that the prior remembers; by default as many as the chunk allows.
+        sigma_unit: unit of sigma: ``model`` (normalised actions) or ``std`` (standard deviations of the
+        data).
+        action_std: standard deviations of actions for ``std``; taken from the dataset, and saved.
         cold_probability: share of the training windows whose history is withheld.
     """
 
@@ -40,14 +41,14 @@ class WarmConfigMixin:
     cold_probability: float = 0.0
 
     def make_prior(self) -> Prior:
-        """The source distribution; a ``ValueError`` if there is none of that name and these options."""
+        """Make the source; a ``ValueError`` if the name or an option is unknown."""
         kind = registered(Prior, self.prior.partition(",")[0], OWN_PRIORS)
         chunk = super().action_delta_indices  # type: ignore[misc]  # LeRobot's configuration has it
         room = len(chunk) // kind.prediction_chunks
         return build(kind, self.prior, room if self.prior_chunk is None else self.prior_chunk)
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
-        """Options without which saved weights mean something else; a training may change the source."""
+        """Return the options that saved weights depend on; a training may change the source."""
         if training:
             return {}
         unit = {"sigma_unit": self.sigma_unit, "action_std": self.action_std}
@@ -55,7 +56,7 @@ class WarmConfigMixin:
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """Steps that LeRobot loads of every action: the history, and the chunk."""
+        """Return the steps of every action that LeRobot loads: the history, and the chunk."""
         chunk = super().action_delta_indices  # type: ignore[misc]
         return history_indices(self.make_prior().history_length, len(chunk))
 
@@ -63,10 +64,10 @@ class WarmConfigMixin:
 @PreTrainedConfig.register_subclass("warm_smolvla")
 @dataclass
 class WarmSmolVLAConfig(WarmConfigMixin, SmolVLAConfig):
-    """SmolVLA's options and those of the source."""
+    """SmolVLA's options, and those of the source."""
 
 
 @PreTrainedConfig.register_subclass("warm_pi05")
 @dataclass
 class WarmPI05Config(WarmConfigMixin, PI05Config):
-    """PI05's options and those of the source."""
+    """PI05's options, and those of the source."""

@@ -1,4 +1,4 @@
-"""A policy of this library as one that ``lerobot-eval`` runs.
+"""Export of a saved policy to LeRobot, for ``lerobot-eval``.
 
 python -m lerobot_policy_warmprior.export POLICY_FOLDER LEROBOT_FOLDER
 """
@@ -31,15 +31,14 @@ _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.stat
 def export_policy(folder: str | Path, out: str | Path) -> Path:
     """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``; ``out`` must not exist.
 
-    Its observation is what converted demonstrations have (``python -m warmprior convert``): the state of the
-    objects as ``observation.environment_state``, that of the robot as ``observation.state``. Of an unknown
-    environment all of it is the latter.
+    Its observations are named as in converted demonstrations (``python -m warmprior convert``): the state of
+    the objects is ``observation.environment_state``, that of the robot ``observation.state``. In an unknown
+    environment the whole vector is ``observation.state``.
 
     Raises:
         FileExistsError: if ``out`` exists.
-        ValueError: if the policy has images, absolute actions, no normaliser, another sampler than
-            Euler's in uniform steps from the source, a network that sees the last actions, or a prior with
-            networks of its own.
+        ValueError: if the policy has images, absolute actions, no normaliser, another sampler than Euler's in
+            uniform steps from the source, a network that sees the last actions, or a learned prior.
     """
     out = Path(out)
     if out.exists():
@@ -49,19 +48,19 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     sees_history = actor.sees_history
     if sees_history or "images" in described or "actions" in described:
         raise ValueError(
-            f"{folder}: policies of images, absolute actions or observed last actions need what stands "
-            "beside the environment here; only policies of states and pose deltas can be exported"
+            f"{folder}: policies with images, absolute actions or observed last actions need transforms that "
+            "LeRobot does not have: export a policy with states and pose deltas"
         )
     if actor.normalizer is None or actor.sampling.clip != 1.0:
         raise ValueError(
             f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
-            f"{actor.sampling.clip}), which are those of LeRobot's policy"
+            f"{actor.sampling.clip}), because warm_flow has both"
         )
     sampler = actor.sampling.solver, actor.sampling.grid, actor.ode.guidance, actor.start
     if sampler != ("euler", "uniform", None, None):
         raise ValueError(
             f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, from the "
-            f"source, and the policy has (solver, grid, guidance, start)={sampler}: change it first, as by "
+            f"source, and the policy has (solver, grid, guidance, start)={sampler}: change it first, as with "
             "actor.replace(solver='euler', grid='uniform', guidance=None, start=None), and save it"
         )
     prior, network, normalizer = actor.prior, cast(VelocityNetwork, actor.network), actor.normalizer
@@ -103,10 +102,10 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line, and return the exit code."""
     parser = argparse.ArgumentParser(prog="lerobot_policy_warmprior.export", description=__doc__)
-    parser.add_argument("folder", type=Path, help="of a saved policy")
-    parser.add_argument("out", type=Path, help="to write; must not exist")
+    parser.add_argument("folder", type=Path, help="folder of the saved policy")
+    parser.add_argument("out", type=Path, help="folder to write, which must not exist")
     args = parser.parse_args(argv)
     print(export_policy(args.folder, args.out))
     return 0

@@ -1,4 +1,4 @@
-"""Saved policies, loaded whole and as what they are, or not at all."""
+"""Loading of saved policies, with errors for weights and options that do not fit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HUB = ("token", "cache_dir", "local_files_only", "force_download", "proxies", "r
 """Options of a download."""
 
 OLD_BUFFERS = re.compile(r"(un)?normalize_(inputs|targets|outputs)\.")
-"""Of policies that normalised by themselves, before LeRobot had processors."""
+"""Names of buffers of old policies, which normalised before LeRobot had processors."""
 
 STATISTICS = {
     NormalizationMode.MEAN_STD: ("mean", "std"),
@@ -27,7 +27,7 @@ STATISTICS = {
     NormalizationMode.QUANTILES: ("q01", "q99"),
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
-"""What LeRobot's normalisation needs to know; without it, it silently does nothing."""
+"""Statistics that LeRobot's normalisation needs; without them it silently does nothing."""
 
 
 def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
@@ -41,17 +41,17 @@ def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
         return {}
     content = read_json(file)
     if not isinstance(content, dict):
-        raise ValueError(f"{file} has no names and values: choose another policy")
+        raise ValueError(f"{file} is no JSON object: choose another policy")
     return content
 
 
 def check_statistics(config: Any, meta: Any) -> None:
-    """Refuse, by a ``ValueError``, a dataset without the statistics by which a policy normalises."""
+    """Raise ValueError for a dataset without the statistics that the policy's normalisation needs."""
     features, missing = {**config.input_features, **config.output_features}, []
     for name, feature in features.items():
         mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
-        known = (meta.stats or {}).get(name, {})
-        missing += [f"{name}: {n}" for n in STATISTICS.get(mode, ()) if n not in known]
+        stats = (meta.stats or {}).get(name, {})
+        missing += [f"{name}: {n}" for n in STATISTICS.get(mode, ()) if n not in stats]
     if missing:
         raise ValueError(
             f"{meta.root}/meta/stats.json lacks {', '.join(missing)}: LeRobot would train on raw values. "
@@ -61,30 +61,30 @@ def check_statistics(config: Any, meta: Any) -> None:
 
 
 class WholePolicy(nn.Module):
-    """Comes before a policy of LeRobot, whose ``from_pretrained`` leaves random what a file does not hold."""
+    """Base class in front of a policy of LeRobot, whose ``from_pretrained`` ignores missing weights."""
 
     config_class: Any
     name: str
     _misfit: ClassVar[str | None] = "no model.safetensors"
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
-        """Load weights, and remember what does not fit."""
-        own = self.state_dict()
-        loaded = {own[name].data_ptr() for name in own.keys() & state_dict.keys()}
+        """Load weights, and note those that do not fit."""
+        weights = self.state_dict()
+        loaded = {weights[name].data_ptr() for name in weights.keys() & state_dict.keys()}
         wrong = {
-            # Tied weights are in a file once.
-            "missing": [n for n, v in own.items() if n not in state_dict and v.data_ptr() not in loaded],
-            "unexpected": [n for n in state_dict if n not in own and not OLD_BUFFERS.match(n)],
+            # A file has tied weights once.
+            "missing": [n for n, v in weights.items() if n not in state_dict and v.data_ptr() not in loaded],
+            "unexpected": [n for n in state_dict if n not in weights and not OLD_BUFFERS.match(n)],
             "of another shape": [
-                n for n, v in own.items() if n in state_dict and v.shape != state_dict[n].shape
+                n for n, v in weights.items() if n in state_dict and v.shape != state_dict[n].shape
             ],
         }
-        said = [
+        problems = [
             f"{len(names)} {what}: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
             for what, names in wrong.items()
             if names
         ]
-        self.__dict__["_misfit"] = "; ".join(said) or None
+        self.__dict__["_misfit"] = "; ".join(problems) or None
         return super().load_state_dict(state_dict, *args, **kwargs)
 
     @classmethod
@@ -96,11 +96,11 @@ class WholePolicy(nn.Module):
         cli_overrides: Sequence[str] = (),
         **kwargs: Any,
     ) -> Self:
-        """A saved policy, or a checkpoint of its family.
+        """Load a saved policy, or a checkpoint of its family.
 
         Raises:
             ValueError: if weights are missing, unexpected or of another shape, or an option contradicts the
-                saved ones.
+                saved options.
             FileNotFoundError: if there is no such policy.
         """
         place = str(pretrained_name_or_path)
@@ -118,9 +118,9 @@ class WholePolicy(nn.Module):
         except RuntimeError as error:
             if "state_dict" not in str(error):
                 raise
-            misfit = str(error)  # names the weights
+            misfit = str(error)  # it names the weights
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"{place} holds no policy: {error}") from error
+            raise FileNotFoundError(f"{place} has no policy: {error}") from error
         if misfit == WholePolicy._misfit:
             raise FileNotFoundError(f"{place} has no model.safetensors: choose the folder of a saved policy")
         if misfit:
@@ -131,15 +131,15 @@ class WholePolicy(nn.Module):
         return policy
 
 
-def check_options(place: str, saved: Any, given: Any, *, training: bool) -> None:
+def check_options(place: str, saved: Any, requested: Any, *, training: bool) -> None:
     """Raise ValueError if options contradict those that a saved policy was trained with."""
-    before, now = (config.meaning(training=training) for config in (saved, given))
+    before, now = (config.meaning(training=training) for config in (saved, requested))
     changes = [f"{name}={now[name]!r} (it has {before[name]!r})" for name in now if now[name] != before[name]]
     if changes:
         raise ValueError(f"{place} was trained with other options than {', '.join(changes)}: leave them out")
 
 
-def check_known(name: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+def check_known(name: str, arguments: Mapping[str, Any], names: Sequence[str]) -> None:
     """Raise TypeError for unknown keyword arguments, which LeRobot's policies ignore."""
-    if unknown := sorted(given.keys() - set(known)):
-        raise TypeError(f"{name} takes no {', '.join(unknown)}: it takes {', '.join(known)}")
+    if unknown := sorted(arguments.keys() - set(names)):
+        raise TypeError(f"{name} takes no {', '.join(unknown)}: it takes {', '.join(names)}")

@@ -1,4 +1,4 @@
-"""``--policy.type=warm_flow``: a policy of this library as one of LeRobot."""
+"""``--policy.type=warm_flow``: this library's policy for LeRobot."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from warmprior.training import ema_of, precondition
 
 
 def training_episodes(meta: Any) -> list[int] | None:
-    """Numbers of the episodes that a training reads; ``None`` for all.
+    """Return the numbers of the episodes that a training reads; ``None`` for all.
 
-    LeRobot gives a policy the metadata, which is of all episodes: only its dataset, which holds them, knows.
+    LeRobot gives a policy only the metadata of all episodes, so the dataset that holds them is searched.
     """
     datasets = (o for o in gc.get_objects() if issubclass(type(o), LeRobotDataset))
     dataset = next((o for o in datasets if o.meta is meta), None)
@@ -55,9 +55,12 @@ def training_episodes(meta: Any) -> list[int] | None:
 class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
 
-    A training's ``dataset_meta`` is of the dataset to whose training episodes the preconditioning is fitted,
-    also where it goes on from a saved policy. A ``ValueError`` if the network does not fit it, it has no
-    statistics, or the prior has networks of its own, which LeRobot would not train.
+    In a training, preconditioning is fitted to the training episodes of the dataset of ``dataset_meta``, even
+    if the training continues from a saved policy.
+
+    Raises:
+        ValueError: if the network does not fit the dataset, the dataset has no statistics, or the prior is
+            learned, which LeRobot would not train.
     """
 
     config_class = WarmFlowConfig
@@ -77,11 +80,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         prior = config.make_prior()
         if isinstance(prior, nn.Module):
             raise ValueError(
-                f"prior={config.prior!r} is trained beside the flow: lerobot-train does not; take past, "
-                "preview or gaussian"
+                f"prior={config.prior!r} is learned, and lerobot-train trains no prior: choose past, preview "
+                "or gaussian"
             )
-        seen = {**config.input_features, **config.output_features}
-        self._widths = {name: seen[name].shape[0] for name in (*config.observed, keys.ACTION)}
+        features = {**config.input_features, **config.output_features}
+        self._widths = {name: features[name].shape[0] for name in (*config.observed, keys.ACTION)}
         width = sum(self._widths[name] for name in config.observed)
         self._cameras, encoder = list(config.image_features), None
         if self._cameras:
@@ -89,11 +92,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             encoder = ImageEncoder(
                 self._cameras,
                 width,
-                backbone=cast(Any, backbone),  # which the configuration has checked
+                backbone=cast(Any, backbone),  # checked by the configuration
                 image_size=config.image_size,
                 crop_size=config.crop_size,
             )
-            # A saved policy has its weights in its file.
+            # A saved policy's weights are in its file.
             if pretrained and dataset_meta is not None and not config.pretrained_path:
                 load_imagenet(encoder)
             width = encoder.observation_dim
@@ -126,23 +129,23 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             network = VisionNetwork(encoder, network)
         if config.precondition and not preconditioned:
             network = self._preconditioned(network, prior, dataset_meta)
-        # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered. In other units than
-        # those of the extremes it is not known.
+        # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
+        # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
         self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
-        # A saved policy's moments are those of other data, which were normalised otherwise.
+        # A saved policy's moments are those of other data with another normalisation.
         fitted = {n: v for n, v in self.state_dict().items() if ".moments." in n}
         self.__dict__["_fitted"] = {} if dataset_meta is None else {n: v.clone() for n, v in fitted.items()}
-        # Of the same weights, so that it is no part of the module and is not saved again.
-        self.__dict__["_made"] = None
+        # The loss shares the actor's weights; outside of the module it is not saved a second time.
+        self.__dict__["_loss_of_actor"] = None
         self.reset()
 
     def _preconditioned(
         self, network: VelocityNetwork, prior: Prior, dataset_meta: Any
     ) -> PreconditionedNetwork:
-        """The network in the moments of source and demonstrations; a saved policy has its own in its file."""
+        """Precondition the network by the moments of source and data; a saved policy's are in its file."""
         if dataset_meta is None:
             return PreconditionedNetwork(network)
         mode = self.config.normalization_mapping.get("ACTION")
@@ -153,7 +156,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             )
         episodes = training_episodes(dataset_meta)
         steps = lerobot_steps(dataset_meta.root, self.config.observed, episodes=episodes)
-        # LeRobot's own arithmetic: a dimension that never changes is -1.
+        # LeRobot's own step, because it maps a constant dimension to -1.
         features = {keys.ACTION: self.config.action_feature}
         norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
         steps[keys.ACTION] = norm({TransitionKey.ACTION: steps[keys.ACTION]})[TransitionKey.ACTION]
@@ -166,26 +169,26 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         )
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
-        """Load weights; moments that were fitted to a training's data stay."""
+        """Load weights, and keep moments that were fitted to a training's data."""
         return super().load_state_dict({**state_dict, **self._fitted}, *args, **kwargs)
 
     def update(self) -> None:
-        """Average the weights: LeRobot calls it after every step of a training."""
+        """Average the weights; LeRobot calls this after every training step."""
         self.averaged.update_parameters(self.actor.network)
 
     @property
     def acting(self) -> WarmPriorActor:
-        """The actor with the weights that play: the averaged ones, once there are any."""
+        """Return the actor for decisions, which has the averaged weights, once there are any."""
         return self.actor.replace(network=self.averaged.module) if self.averaged.n_averaged else self.actor
 
     def get_optim_params(self) -> Any:
-        """Weights that decay, and those that do not."""
+        """Return the weights with decay, and those without."""
         return cast(VelocityNetwork, self.actor.network).parameter_groups(self.config.optimizer_weight_decay)
 
     def reset(self) -> None:
-        """New episodes in all environments."""
-        seen = (*self.config.observed, *self._cameras)
-        self._queues = {name: deque(maxlen=self.config.n_obs_steps) for name in seen}
+        """Start new episodes in all environments."""
+        names = (*self.config.observed, *self._cameras)
+        self._queues = {name: deque(maxlen=self.config.n_obs_steps) for name in names}
         self._queues["action"] = deque(maxlen=self.config.n_action_steps)
         prior = self.actor.prior
         self.__dict__["_memory"] = ActionMemory(prior, self.config.action_feature.shape[0])
@@ -193,17 +196,18 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, float]]:
-        """Conditional flow matching (Algorithm 1).
+        """Return the conditional flow-matching loss (Algorithm 1).
 
-        ``batch`` has ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in
-        front, the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``. The reduction
-        ``"none"`` gives the loss of each sample, ``[B]``, its mean over what is not padded.
+        ``batch`` has ``"action"``, ``[B, H + P, d_a]``, with the remembered actions first,
+        ``"action_is_pad"``, observations ``[B, To, d]``, and images in [0, 1], ``[B, To, 3, h, w]``. The
+        reduction ``"none"`` gives the loss of each sample, ``[B]``, averaged over positions that are not
+        padded.
         """
         check_choice("reduction", reduction, ("mean", "none"))
         if "action_is_pad" not in batch:
             raise KeyError(
-                "the batch lacks action_is_pad: the history before an episode is its first action, the "
-                "target, and must be masked"
+                "the batch lacks action_is_pad: pass it, because LeRobot pads the history before an episode "
+                "with its first action, which is the target"
             )
         batch = with_width(batch, self._widths)
         prior = self.actor.prior
@@ -223,29 +227,29 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         )
         if self.config.cold_probability > 0:
             data = self._withheld(data)
-        made = self._loss()
-        made.reduction = reduction
-        loss = made(data)["loss_flow_matching"]
+        loss_module = self._loss()
+        loss_module.reduction = reduction
+        loss = loss_module(data)["loss_flow_matching"]
         if reduction == "none":
             loss = loss.sum((1, 2)) / (inside.sum(1) * loss.shape[-1]).clamp_min(1)
         return loss, {"flow_matching": loss.mean().item()}
 
     def _loss(self) -> FlowMatchingLoss:
-        """The loss of the weights that the policy has now."""
-        made = self.__dict__["_made"]
-        mine = {id(weight) for weight in self.actor.network.parameters()}
-        # The loss of a copied policy, or of one whose weights were replaced, trains others.
-        if made is None or {id(weight) for weight in made.parameters()} != mine:
-            made = self.__dict__["_made"] = FlowMatchingLoss(self.actor)
-        return made
+        """Return the loss of the policy's present weights."""
+        loss = self.__dict__["_loss_of_actor"]
+        weights = {id(weight) for weight in self.actor.network.parameters()}
+        # A copied policy, or one whose weights were replaced, needs a new loss.
+        if loss is None or {id(weight) for weight in loss.parameters()} != weights:
+            loss = self.__dict__["_loss_of_actor"] = FlowMatchingLoss(self.actor)
+        return loss
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """A new chunk, ``[B, P, d_a]``, normalised.
+        """Return a new chunk, ``[B, P, d_a]``, normalised.
 
-        From present observations ``[B, d]`` and images ``[B, 3, h, w]``, and those since :meth:`reset`.
-        ``executed_steps=`` tells how much of the last chunk was executed, by default as much as
-        :meth:`select_action` returned.
+        It depends on the present observations ``[B, d]`` and images ``[B, 3, h, w]``, and on those since
+        :meth:`reset`. ``executed_steps=`` is the number of executed actions of the last chunk, by default as
+        many as :meth:`select_action` returned.
         """
         executed = kwargs.pop("executed_steps", None)
         check_known("predict_action_chunk", kwargs, ["executed_steps"])
@@ -256,7 +260,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """The next action of every environment, ``[B, d_a]``, normalised."""
+        """Return the next action of every environment, ``[B, d_a]``, normalised."""
         check_known("select_action", kwargs, [])
         self._remember(batch)
         if not self._queues["action"]:
@@ -265,15 +269,15 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         return self._queues["action"].popleft()
 
     def _remember(self, batch: dict[str, Tensor]) -> None:
-        seen = {name: batch[name] for name in (*self.config.observed, *self._cameras)}
+        observations = {name: batch[name] for name in (*self.config.observed, *self._cameras)}
         self._memory.expect(len(batch[self.config.observed[0]]))
-        self._queues = populate_queues(self._queues, seen)
+        self._queues = populate_queues(self._queues, observations)
 
     def _chunk(self) -> Tensor:
         self.eval()
-        seen = {n: torch.stack(list(q), dim=1) for n, q in self._queues.items() if n != "action"}
-        observation = self._observation(seen)
-        first = seen[self.config.observed[0]]
+        queued = {n: torch.stack(list(q), dim=1) for n, q in self._queues.items() if n != "action"}
+        observation = self._observation(queued)
+        first = queued[self.config.observed[0]]
         history = self._memory.decide(len(first), first.device)
         data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, history.shape)
         chunk = self.acting(data)[keys.CHUNK]
@@ -281,7 +285,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         return chunk
 
     def _observation(self, batch: dict[str, Tensor]) -> Tensor | TensorDict:
-        """``[B, To, d_o]``, with images as the entries of an encoder."""
+        """Return the observation ``[B, To, d_o]``, or a TensorDict with images for the encoder."""
         vector = torch.cat([batch[name] for name in self.config.observed], dim=-1)
         if not self._cameras:
             return vector
@@ -289,7 +293,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         return TensorDict({keys.STATE: vector, **images}, [len(vector)])
 
     def _pixels(self, images: Tensor) -> Tensor:
-        """Images in [0, 1], ``[B, To, 3, h, w]``, as uint8 squares."""
+        """Return images in [0, 1], ``[B, To, 3, h, w]``, as uint8 squares."""
         if not images.is_floating_point():
             raise ValueError(
                 f"warm_flow sees images as numbers in [0, 1], as LeRobot loads them, got {images.dtype}"

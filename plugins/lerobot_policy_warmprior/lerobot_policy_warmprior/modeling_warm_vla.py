@@ -16,13 +16,13 @@ from warmprior.lerobot import WarmPriorAdapter, action_std
 from warmprior.lerobot.adapter import LEFT_OVER
 
 REAL_TIME = ("inference_delay", LEFT_OVER, "execution_horizon")
-"""What LeRobot's real-time chunking passes."""
+"""Arguments that LeRobot's real-time chunking passes."""
 
 
 class WarmPolicyMixin(WholePolicy):
-    """Comes before a policy of LeRobot: its losses and chunks start from the prior.
+    """Base class in front of a policy of LeRobot, so that its losses and chunks start from the prior.
 
-    ``dataset_stats`` and ``dataset_meta`` are of a training's dataset, from which ``action_std`` is taken.
+    ``dataset_stats`` and ``dataset_meta`` are those of a training's dataset, which give ``action_std``.
     """
 
     warm_adapter: Any
@@ -33,7 +33,7 @@ class WarmPolicyMixin(WholePolicy):
                 "use_relative_actions=true needs the robot's state at both decisions: use "
                 "warmprior.lerobot.WarmPriorAdapter with RelativeActions around the policy"
             )
-        self.__dict__["warm_adapter"] = None  # the policy's own constructor resets
+        self.__dict__["warm_adapter"] = None  # the policy's own constructor calls reset
         if dataset_meta is not None:
             check_statistics(config, dataset_meta)
         super().__init__(config)
@@ -52,20 +52,20 @@ class WarmPolicyMixin(WholePolicy):
         )
 
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Any:
-        """The policy's own loss, from the prior's source."""
+        """Return the policy's own loss, with source samples from the prior."""
         forward = super().forward
         arguments = inspect.signature(forward).bind(batch, *args, **kwargs).arguments
         return self.warm_adapter.loss(arguments.pop("batch"), forward, **arguments)
 
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """The next action of every environment."""
+        """Return the next action of every environment."""
         check_known("select_action", kwargs, ["noise"])
         return self.warm_adapter.select_action(batch, super().select_action, **kwargs)  # type: ignore[misc]
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """A new chunk; ``executed_steps=`` tells how much of the last one was executed.
+        """Return a new chunk; ``executed_steps=`` is the number of executed actions of the last one.
 
-        So does ``prev_chunk_left_over=``, which LeRobot's real-time chunking passes.
+        ``prev_chunk_left_over=``, which LeRobot's real-time chunking passes, gives it as well.
         """
         executed = kwargs.pop("executed_steps", None)
         check_known("predict_action_chunk", kwargs, ["noise", *REAL_TIME])
@@ -73,13 +73,13 @@ class WarmPolicyMixin(WholePolicy):
         if rtc is not None and not rtc.enabled and LEFT_OVER in kwargs and executed is None:
             raise ValueError(
                 "with --inference.rtc.enabled=false chunks are executed one after the other, however late, "
-                "so what was executed is not known: turn it on, or take --inference.type=sync"
+                "so the executed actions are unknown: turn it on, or use --inference.type=sync"
             )
         predict = super().predict_action_chunk  # type: ignore[misc]
         return self.warm_adapter.predict_action_chunk(batch, executed, predict, **kwargs)
 
     def reset(self) -> None:
-        """New episodes in all environments."""
+        """Start new episodes in all environments."""
         super().reset()  # type: ignore[misc]
         if self.warm_adapter is not None:
             self.warm_adapter.forget()

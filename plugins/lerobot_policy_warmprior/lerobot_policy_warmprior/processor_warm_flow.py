@@ -1,4 +1,4 @@
-"""Normalisation of states and actions by LeRobot's own steps, between raw units and those of the policy."""
+"""Processors of warm_flow: LeRobot's own normalisation of states and actions."""
 
 from lerobot.processor import (
     make_default_pre_post_processors as make_warm_flow_pre_post_processors,

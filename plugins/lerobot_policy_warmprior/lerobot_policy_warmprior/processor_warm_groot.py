@@ -1,4 +1,4 @@
-"""GR00T's own processors, which keep the remembered actions apart from the chunk."""
+"""GR00T's processors, extended by the remembered actions."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ STEP = "warm_groot_pack_inputs"
 @dataclass
 @ProcessorStepRegistry.register(STEP)
 class WarmGrootPackInputsStep(GrootN17PackInputsStep):
-    """Packs the chunk as GR00T does, which takes no longer one, and the actions before it beside it."""
+    """Packs the chunk as GR00T does, and the actions before it under a key of their own."""
 
     history_length: int = 0
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """The packed transition, with ``action_history`` if it has actions.
+        """Return the packed transition, with ``action_history`` if it has actions.
 
         Raises:
-            ValueError: if the checkpoint's actions are relative, each position with statistics of its own.
+            ValueError: if the checkpoint's actions are relative, with statistics per position.
         """
         if self._uses_relative_action_groups():
             raise ValueError(
@@ -62,27 +62,27 @@ class WarmGrootPackInputsStep(GrootN17PackInputsStep):
 def make_warm_groot_pre_post_processors(
     config: WarmGrootConfig, dataset_stats: Any = None, dataset_meta: Any = None
 ) -> tuple[Any, Any]:
-    """GR00T's processors, the packing step of which knows the length of the history."""
+    """Make GR00T's processors, with a packing step for the remembered actions."""
     before, after = make_groot_pre_post_processors(config, dataset_stats, dataset_meta)
     (at,) = (i for i, step in enumerate(before.steps) if isinstance(step, GrootN17PackInputsStep))
-    own = {f.name: getattr(before.steps[at], f.name) for f in fields(before.steps[at]) if f.init}
-    pack = WarmGrootPackInputsStep(**own, history_length=config.make_prior().history_length)
+    arguments = {f.name: getattr(before.steps[at], f.name) for f in fields(before.steps[at]) if f.init}
+    pack = WarmGrootPackInputsStep(**arguments, history_length=config.make_prior().history_length)
     before.steps[at] = pack
-    for step in after.steps:  # decodes by the state that was packed
+    for step in after.steps:  # it decodes by the packed state
         if hasattr(step, "pack_step"):
             step.pack_step = pack
     return before, after
 
 
 def check_pretrained(config: WarmGrootConfig, place: str, **hub: Any) -> None:
-    """Refuse a saved policy, whose processors LeRobot takes, if they remember other actions.
+    """Check the processors of a saved policy, which LeRobot reuses.
 
-    ``hub`` is for the download, such as ``revision``.
+    ``hub`` has options of the download, such as ``revision``.
 
     Raises:
         ValueError: if they are GR00T's own, or remember another number of actions.
     """
-    # A checkpoint of GR00T itself has none.
+    # GR00T's own checkpoints have no such step.
     steps = saved_json(place, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", **hub).get("steps", [])
     packs = [step["config"]["history_length"] for step in steps if step.get("registry_name") == STEP]
     length = config.make_prior().history_length

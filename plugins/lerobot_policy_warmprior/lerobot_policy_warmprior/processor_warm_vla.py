@@ -1,4 +1,4 @@
-"""The policies' own processors: the source is in the units that they make."""
+"""Processors of the warm VLAs: the policies' own, in whose units the source is."""
 
 from lerobot.policies.pi05.processor_pi05 import (
     make_pi05_pre_post_processors as make_warm_pi05_pre_post_processors,

@@ -19,7 +19,7 @@ from warmprior.envs.tasks import get_task
 
 
 class RobosuiteGymEnv(gymnasium.Env):
-    """One environment of :class:`~warmprior.envs.RobosuiteEnv`; see ``RobosuiteEnvConfig`` for options."""
+    """Gymnasium interface of :class:`~warmprior.envs.RobosuiteEnv`; its options are in the configuration."""
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # Gymnasium annotates no class variable
         "render_modes": ["rgb_array"],
@@ -40,7 +40,7 @@ class RobosuiteGymEnv(gymnasium.Env):
             options |= {"camera": list(cameras), "from_pixels": True}
         self._env = RobosuiteEnv(task, **options)
         spec = self._env.task
-        assert spec is not None  # a task by its name has one
+        assert spec is not None  # named tasks have one
         self.task = self.task_description = spec.name
         self._object_dim, self._cameras = spec.object_dim, list(cameras)
         self._max_episode_steps = spec.horizon(style) if horizon is None else horizon
@@ -50,60 +50,60 @@ class RobosuiteGymEnv(gymnasium.Env):
         def box(width: int) -> gymnasium.spaces.Box:
             return gymnasium.spaces.Box(-np.inf, np.inf, (width,), np.float32)
 
-        seen: dict[str, gymnasium.Space] = {"agent_pos": box(spec.observation_dim - spec.object_dim)}
+        spaces: dict[str, gymnasium.Space] = {"agent_pos": box(spec.observation_dim - spec.object_dim)}
         if cameras:
             image = gymnasium.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
-            seen["pixels"] = gymnasium.spaces.Dict({camera: image for camera in cameras})
+            spaces["pixels"] = gymnasium.spaces.Dict({camera: image for camera in cameras})
         else:
-            seen["environment_state"] = box(spec.object_dim)
-        self.observation_space = gymnasium.spaces.Dict(seen)
+            spaces["environment_state"] = box(spec.object_dim)
+        self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin the episode of a seed, or the next one."""
+        """Start the episode of a seed, or the next one."""
         super().reset(seed=seed)
         if seed is not None:
             self._env.set_seed(seed, static_seed=True)
-        return self._seen(self._env.reset()), {"is_success": False}
+        return self._observation(self._env.reset()), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control step; actions beyond ``[-1, 1]`` are clipped, as the simulator's are."""
+        """Take a control step; actions are clipped to ``[-1, 1]``."""
         value = torch.as_tensor(np.clip(action, -1.0, 1.0), dtype=torch.float32)
         step = self._env.step(TensorDict({"action": value}, []))["next"]
         info = {"is_success": bool(step["success"])}
         ended = bool(step["terminated"]), bool(step["truncated"])
-        return self._seen(step), float(step["reward"]), *ended, info
+        return self._observation(step), float(step["reward"]), *ended, info
 
     def render(self) -> np.ndarray:
-        """A picture of the scene, ``[h, w, 3]`` uint8."""
+        """Return a picture of the scene, ``[h, w, 3]`` uint8."""
         return self._env.render_frame(size=256)
 
     def close(self) -> None:
         """Free the simulator."""
         self._env.close(raise_if_closed=False)
 
-    def _seen(self, data: Any) -> dict[str, Any]:
-        observation = data["observation"].numpy()
-        seen: dict[str, Any] = {"agent_pos": observation[self._object_dim :]}
+    def _observation(self, data: Any) -> dict[str, Any]:
+        vector = data["observation"].numpy()
+        observation: dict[str, Any] = {"agent_pos": vector[self._object_dim :]}
         if not self._cameras:
-            return {**seen, "environment_state": observation[: self._object_dim]}
+            return {**observation, "environment_state": vector[: self._object_dim]}
         pixels = data["pixels"]
         images = {self._cameras[0]: pixels} if torch.is_tensor(pixels) else dict(pixels.items())
-        return {**seen, "pixels": {name: image.numpy() for name, image in images.items()}}
+        return {**observation, "pixels": {name: image.numpy() for name, image in images.items()}}
 
 
 @EnvConfig.register_subclass("warmprior_robosuite")
 @dataclass
 class RobosuiteEnvConfig(EnvConfig):
-    """A task of robosuite with the observations that ``python -m warmprior convert`` gives demonstrations.
+    """Options of a robosuite task with the observations of ``python -m warmprior convert``.
 
     Attributes:
-        task: a name of ``warmprior.envs.TASKS``.
-        style: of the demonstrations, ``ph`` or ``mh``; decides the time limit.
-        cameras: to render; with them the state of the objects is left out, as in image datasets.
+        task: name of the task in ``warmprior.envs.TASKS``.
+        style: style of the demonstrations, ``ph`` or ``mh``, which decides the time limit.
+        cameras: cameras to render; with any, the state of the objects is left out, as in image datasets.
         image_size: side of the images in pixels.
-        episode_length: time limit in control steps; the task's by default.
+        episode_length: control steps per episode; the task's by default.
     """
 
     task: str = "lift"
@@ -139,7 +139,7 @@ class RobosuiteEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of the environment."""
+        """Return the arguments of the environment."""
         return {
             "task": self.task,
             "style": self.style,
@@ -151,7 +151,7 @@ class RobosuiteEnvConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
-        """One batch of environments; in worker processes, they need not know of any registry."""
+        """Make a batch of environments, with ``use_async_envs`` in worker processes."""
         make = partial(RobosuiteGymEnv, **self.gym_kwargs)
         options: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
         batch: gymnasium.vector.VectorEnv

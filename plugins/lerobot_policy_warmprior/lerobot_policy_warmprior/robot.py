@@ -1,4 +1,4 @@
-"""Policies that LeRobot has trained, for :class:`warmprior.deploy.AsyncExecutor`."""
+"""Policies trained by LeRobot, for :class:`warmprior.deploy.AsyncExecutor`."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from warmprior.modules.encoder import ImageEncoder
 
 
 def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> WarmPriorActor | LeRobotActor:
-    """A saved policy of the plugin that acts on raw observations, in the units of the demonstrations.
+    """Load a saved policy of the plugin that acts on raw observations, in the units of the demonstrations.
 
-    It has the processors that LeRobot saved beside it. Cameras have the last part of LeRobot's names:
-    ``"front"`` for ``observation.images.front``. The ``"state"`` of a ``warm_flow`` policy is all of its
-    vectors in their order, ``observation.environment_state`` before ``observation.state``.
+    It includes the processors that LeRobot saved with it. Cameras have the last part of LeRobot's names:
+    ``"front"`` for ``observation.images.front``. The ``"state"`` of a ``warm_flow`` policy is the
+    concatenation of its vectors, ``observation.environment_state`` before ``observation.state``.
 
     Args:
         place: a folder, such as ``run/checkpoints/last/pretrained_model``, or a repository of the hub.
 
     Keyword Args:
-        task: what it is to do, for policies that read language.
-        device: where it computes.
+        task: the instruction, for policies that read language.
+        device: device of the policy.
 
     Raises:
-        ValueError: if a ``warm_flow`` policy has another normalisation than by extremes.
+        ValueError: if a ``warm_flow`` policy has another normalisation than MIN_MAX.
     """
     config = PreTrainedConfig.from_pretrained(str(place))
     config.device = device
@@ -51,15 +51,15 @@ def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> War
 
 
 def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
-    """The averaged weights, which play, with the extremes that LeRobot saved as the normaliser."""
+    """Return the actor of averaged weights, with LeRobot's saved extremes as its normaliser."""
     config = policy.config
     modes = {config.normalization_mapping.get(kind) for kind in ("STATE", "ENV", "ACTION")}
     if modes != {NormalizationMode.MIN_MAX}:
         raise ValueError(
-            f"load_actor knows the normalisation MIN_MAX of warm_flow, not {config.normalization_mapping}"
+            f"load_actor needs the normalisation MIN_MAX, and the policy has {config.normalization_mapping}"
         )
     stats = next(step for step in preprocessor.steps if isinstance(step, NormalizerProcessorStep)).stats
-    seen = (keys.OBSERVATION, keys.STATE) if config.image_features else keys.OBSERVATION
+    state = (keys.OBSERVATION, keys.STATE) if config.image_features else keys.OBSERVATION
     bounds = [_bounds(stats[name]) for name in config.observed]
     low, high = (torch.cat(ends) for ends in zip(*bounds, strict=True))
     least, most = _bounds(stats[keys.ACTION])
@@ -67,11 +67,11 @@ def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
     for part in actor.network.modules():
         if isinstance(part, ImageEncoder):
             part.cameras = tuple(name.rpartition(".")[2] for name in part.cameras)
-    normalizer = Normalizer({seen: low, keys.ACTION: least}, {seen: high, keys.ACTION: most})
+    normalizer = Normalizer({state: low, keys.ACTION: least}, {state: high, keys.ACTION: most})
     return actor.replace(normalizer=normalizer)
 
 
 def _bounds(stats: dict[str, Any]) -> tuple[Tensor, Tensor]:
-    """Minimum and maximum; above a dimension that never changes, which LeRobot normalises to -1."""
+    """Return minimum and maximum; constant dimensions get a range, whose low end LeRobot maps to -1."""
     low, high = (torch.as_tensor(stats[name], dtype=torch.float32).flatten() for name in ("min", "max"))
     return low, torch.where(high > low, high, low + 2.5e-5 * low.abs().clamp_min(1.0))
