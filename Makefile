@@ -1,16 +1,16 @@
-# Everything runs in .venv, which `make install` prepares once; pinned versions are in constraints.txt.
+# Everything runs in .venv, which `make install` prepares once with the versions of constraints.txt.
 PYTHON ?= $(shell command -v python3.12 || command -v python3 || command -v python)
 BIN := .venv/bin
 ARGS ?=
 EXTRAS := sim,vision,lerobot,vla,minari,ray,docs,dev
 PLUGIN := plugins/lerobot_policy_warmprior
 
-# GR00T N1.5 is in lerobot 0.5.1 alone, which needs an environment of its own.
+# GR00T N1.5 is only in lerobot 0.5.1, which needs a separate environment.
 GROOT := .venv-groot
 GROOT_NEEDS := tests/lerobot/groot_n15.txt
 
 CHECK_PYTHON := $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
-	{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
+	{ echo "warmprior needs Python 3.12 or newer: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
 
 .PHONY: install benchmark throughput gpu test test-slow test-core test-groot-n15 latest lint fuzz results docs dist clean
 
@@ -24,7 +24,7 @@ install: .venv/installed
 	$(BIN)/python -m pip install --quiet --no-deps --editable $(PLUGIN)
 	@touch $@
 
-# The benchmark alone needs a fraction of the packages, and nothing compiled beforehand.
+# The benchmark needs few of the packages; skipping bytecode makes the first run start sooner.
 .venv/simulator: pyproject.toml constraints.txt
 	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv .venv
@@ -37,21 +37,21 @@ benchmark: $(if $(wildcard .venv/installed),install,.venv/simulator)
 throughput: install
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
-# What needs a GPU, in parts that resume: make gpu PART=2, or all.
+# The parts that need a GPU: make gpu PART=2, or all. Finished parts are skipped.
 gpu: install
 	$(BIN)/python benchmarks/gpu.py $(if $(PART),--part $(PART)) $(ARGS)
 
-# Files side by side, one per core: tests of one file share what they have trained.
+# A process per core; tests of one file share a process, and the policies that they train.
 PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile
 
 test: install
 	$(PYTEST) -m "not slow" $(ARGS)
 
-# The built documentation, the wheel in an empty environment, long trainings.
+# Slow tests: the built documentation, the wheel in an empty environment, long trainings.
 test-slow: install
 	$(PYTEST) -m slow $(ARGS)
 
-# The core, without the simulator, on any system.
+# Tests of the core without the simulator, on any system.
 CORE := .venv-core
 test-core:
 	@$(CHECK_PYTHON)
@@ -70,7 +70,7 @@ $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 test-groot-n15: $(GROOT)/installed
 	$(GROOT)/bin/python -m pytest tests/lerobot/test_ports.py tests/lerobot/test_groot_n15.py $(ARGS)
 
-# The newest packages that the bounds of pyproject.toml admit, without constraints.txt.
+# Tests with the newest packages that pyproject.toml admits, without constraints.txt.
 LATEST := .venv-latest
 latest:
 	$(PYTHON) -m venv $(LATEST)
@@ -87,7 +87,7 @@ lint: install
 fuzz: install
 	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
 
-# The charts and the table of the results page, from docs/results; flowchart and timeline.
+# Charts and tables of the results pages, from docs/results, and the diagrams.
 results: install
 	PYTHONPATH=benchmarks $(BIN)/python docs/figures/results.py
 	PYTHONPATH=benchmarks $(BIN)/python docs/figures/leaderboard.py

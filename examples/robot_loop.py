@@ -1,8 +1,8 @@
-"""A policy on a robot, at a fixed rate: connect, reset, act, hold, stop.
+"""Run a policy on a robot at a fixed rate: connect, reset, act, hold, stop.
 
 python examples/robot_loop.py                     # ten seconds against a simulated arm, at 50 Hz
-python examples/robot_loop.py --camera            # the policy sees a camera, and not where the goal is
-python examples/robot_loop.py --decision 0.2      # decisions take longer than a chunk lasts: the robot holds
+python examples/robot_loop.py --camera            # the policy sees the goal only by a camera
+python examples/robot_loop.py --decision 0.2      # decisions take longer than a chunk, so the robot holds
 python examples/robot_loop.py --unplug 3          # the robot stops answering after three seconds
 
 For your own robot write the five methods of SimulatedArm, and load your policy in main().
@@ -29,34 +29,34 @@ from warmprior.deploy import AsyncExecutor
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 PATIENCE = 1.0
-"""Seconds for which the robot is held before the loop gives up."""
+"""Seconds that the robot holds before the loop gives up."""
 
 DELAY = 0.05
-"""The longest decision that is expected, in seconds."""
+"""The longest expected decision, in seconds."""
 
 CHUNK, NFE = 8, 3
 
 
 class Robot(Protocol):
-    """The loop calls these methods of a robot."""
+    """The methods of a robot that the loop calls."""
 
     def connect(self) -> None:
-        """Open the connection; the robot may move from here on."""
+        """Open the connection; the robot may move from now on."""
 
     def observe(self) -> dict[str, np.ndarray]:
-        """The vector ``"state"`` and the images, under the names and in the units of the demonstrations.
+        """Return the vector ``"state"`` and the images, with the names and units of the demonstrations.
 
-        Give drivers a time limit: an OSError (a TimeoutError is one) says that the robot did not answer.
+        Give drivers a time limit, and raise OSError (such as TimeoutError) if the robot does not answer.
         """
 
     def act(self, action: np.ndarray) -> None:
         """Send an action, in the units of the demonstrations, and return at once."""
 
     def hold(self) -> None:
-        """Stay where it is. With joint or pose targets the last one does; deltas and velocities become 0."""
+        """Stop moving: keep the last target, or send deltas or velocities of 0."""
 
     def stop(self) -> None:
-        """Bring the robot to rest and close the connection; also where it no longer answers."""
+        """Bring the robot to rest and close the connection, even if it no longer answers."""
 
 
 # ------------------------------------------------------------------------------------ the loop
@@ -64,7 +64,10 @@ class Robot(Protocol):
 
 @dataclass
 class Record:
-    """When steps began, how many by more than half a period late, or held; delays of chunks in steps."""
+    """Start times of steps, numbers of late and held steps, and delays of chunks in steps.
+
+    A step is late if it starts more than half a period after its due time.
+    """
 
     starts: list[float] = field(default_factory=list)
     late: int = 0
@@ -72,7 +75,7 @@ class Record:
     delays: set[int] = field(default_factory=set)
 
     def report(self, period: float) -> str:
-        """Two lines."""
+        """Return two lines on periods, late steps and delays."""
         periods = sorted(1e3 * (b - a) for a, b in zip(self.starts, self.starts[1:], strict=False)) or [0.0]
         p50, p95 = statistics.median(periods), periods[math.ceil(0.95 * len(periods)) - 1]
         delays = f"{min(self.delays)} to {max(self.delays)}" if self.delays else "no"
@@ -83,34 +86,36 @@ class Record:
 
 
 def run(robot: Robot, policy: WarmPriorActor, rate: float, seconds: float) -> Record:
-    """One episode: an action per period, from the chunk that is there; the robot holds where there is none.
+    """Run an episode with an action per period; without an action the robot holds.
 
-    Ctrl-C ends it, and so do problems that last longer than PATIENCE, as a RuntimeError. The robot is stopped
-    in any case.
+    Ctrl-C ends the episode. The robot is stopped in any case.
+
+    Raises:
+        RuntimeError: if the robot has held for longer than PATIENCE.
     """
     period, record = 1 / rate, Record()
     with AsyncExecutor(policy, delay=DELAY, control_rate=rate) as executor:
         try:
             robot.connect()
-            executor.act(robot.observe())  # the first decision takes longest, and the robot rests
-            executor.reset()  # begin every episode with it: the history of the last one is no history
-            begun = due = good = time.monotonic()
-            while due < begun + seconds:
+            executor.act(robot.observe())  # the first decision takes longest; the robot is at rest
+            executor.reset()  # start every episode with this, which clears the history
+            start = due = last_action = time.monotonic()
+            while due < start + seconds:
                 record.starts.append(time.monotonic())
                 if (lag := record.starts[-1] - due) > period / 2:
                     record.late += 1
-                    due += lag  # do not hurry afterwards: actions are for a fixed rate
+                    due += lag  # do not catch up, because actions are for a fixed rate
                 try:
                     robot.act(executor.act(robot.observe()).numpy())
-                    good = time.monotonic()
-                # No action is left and the next chunk is late, the policy failed, or the robot did not
+                    last_action = time.monotonic()
+                # The next chunk is late and no action is left, the policy failed, or the robot did not
                 # answer. The executor tries again at the next step.
                 except Exception as error:
                     record.held += 1
-                    with contextlib.suppress(OSError):  # it may not hear this either
+                    with contextlib.suppress(OSError):  # it may not answer this either
                         robot.hold()
-                    if time.monotonic() - good > PATIENCE:
-                        raise RuntimeError(f"held for {PATIENCE:g} s, and stopped: {error}") from error
+                    if time.monotonic() - last_action > PATIENCE:
+                        raise RuntimeError(f"held for {PATIENCE:g} s, then stopped: {error}") from error
                 record.delays.update(executor.delays)
                 due += period
                 time.sleep(max(0.0, due - time.monotonic()))
@@ -125,9 +130,9 @@ def run(robot: Robot, policy: WarmPriorActor, rate: float, seconds: float) -> Re
 
 
 class SimulatedArm:
-    """Two joints that follow their targets in real time, each half of the way in 50 ms.
+    """Two joints that follow their targets in real time, half of the way in 50 ms.
 
-    The camera shows the arm's joints as a red spot and the goal as a green one, on 96 x 128 pixels.
+    The camera shows the joints as a red spot and the goal as a green one, on 96 x 128 pixels.
     """
 
     def __init__(self, camera: bool, unplug: float = math.inf, seed: int = 0) -> None:
@@ -135,7 +140,7 @@ class SimulatedArm:
         self.generator = np.random.default_rng(seed)
 
     def connect(self) -> None:
-        """Start at rest, with a goal somewhere else."""
+        """Start at rest, with a random goal."""
         self.joints, self.goal = self.generator.uniform(-1, 1, (2, 2))
         self.target = self.joints.copy()
         self.connected = self.moved = time.monotonic()
@@ -149,29 +154,29 @@ class SimulatedArm:
         self.moved = now
 
     def observe(self) -> dict[str, np.ndarray]:
-        """Joint positions, and the goal or the camera's image."""
+        """Return joint positions, and the goal or the camera's image."""
         self._move()
-        if np.abs(self.joints - self.goal).max() < 0.05:  # another one
+        if np.abs(self.joints - self.goal).max() < 0.05:  # reached: choose another goal
             self.goal = self.generator.uniform(-1, 1, 2)
-        return seen(self.joints, self.goal, self.camera)
+        return observation_of(self.joints, self.goal, self.camera)
 
     def act(self, action: np.ndarray) -> None:
-        """Joint targets."""
+        """Set the joint targets."""
         self._move()
         self.target = action
 
     def hold(self) -> None:
-        """The last target stays."""
+        """Keep the last target."""
 
     def stop(self) -> None:
-        """Nothing is left to close."""
+        """Note that the arm was stopped; there is nothing to close."""
         self.stopped = True
 
 
-def seen(
+def observation_of(
     joints: np.ndarray, goal: np.ndarray, camera: bool, size: tuple[int, int] = (96, 128)
 ) -> dict[str, np.ndarray]:
-    """An observation of the arm."""
+    """Return an observation of the arm."""
     if not camera:
         return {"state": np.concatenate([joints, goal])}
     rows, columns = (np.linspace(-1.2, 1.2, n) for n in size)
@@ -183,29 +188,29 @@ def seen(
 
 
 def demonstrations(camera: bool, rate: float, episodes: int = 40, steps: int = 60) -> TensorDict:
-    """The joints go a part of the way to the goal at every step; actions are the next joint positions."""
+    """Return demonstrations that approach the goal; actions are the next joint positions."""
     generator, rows = np.random.default_rng(0), []
     part = 1 - 0.5 ** (8 / rate)
     for episode in range(episodes):
         joints, goal = generator.uniform(-1, 1, (2, 2))
         for _ in range(steps):
             action = joints + part * (goal - joints)
-            found = seen(joints, goal, camera, (32, 32))  # as small and square as policies see images
-            images = {"front_image": found["front_image"].transpose(2, 0, 1)} if camera else {}
-            rows.append((found["state"], images, action, episode))
+            observed = observation_of(joints, goal, camera, (32, 32))  # the size of the policy's images
+            images = {"front_image": observed["front_image"].transpose(2, 0, 1)} if camera else {}
+            rows.append((observed["state"], images, action, episode))
             joints = action + generator.normal(0, 0.01, 2)
     states, images, actions, numbers = zip(*rows, strict=True)
     observation = torch.tensor(np.array(states), dtype=torch.float32)
-    steps_of: dict = {"observation": observation, "episode": torch.tensor(numbers)}
+    data: dict = {"observation": observation, "episode": torch.tensor(numbers)}
     if camera:
         pictures = torch.from_numpy(np.array([image["front_image"] for image in images]))
-        steps_of["observation"] = TensorDict({"state": observation, "front_image": pictures}, [len(rows)])
-    steps_of["action"] = torch.tensor(np.array(actions), dtype=torch.float32)
-    return TensorDict(steps_of, [len(rows)])
+        data["observation"] = TensorDict({"state": observation, "front_image": pictures}, [len(rows)])
+    data["action"] = torch.tensor(np.array(actions), dtype=torch.float32)
+    return TensorDict(data, [len(rows)])
 
 
 def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
-    """A small policy, in a few seconds."""
+    """Train a small policy, in a few seconds."""
     return train_policy(
         demonstrations(camera, rate),
         PastPrior(CHUNK, correlation=0.5),
@@ -220,18 +225,17 @@ def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train the policy, run the loop, and say how even its steps were."""
+    """Train the policy, run the loop, and report the timing of its steps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--rate", type=float, default=50.0, help="control steps per second")
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--camera", action="store_true", help="see the goal by a camera alone")
-    parser.add_argument(
-        "--decision", type=float, default=0.0, help="make every decision take longer, in seconds"
-    )
-    parser.add_argument("--unplug", type=float, default=math.inf, help="when the robot stops answering")
-    parser.add_argument("--iterations", type=int, default=300, help="of the training")
+    add = parser.add_argument
+    add("--rate", type=float, default=50.0, help="control steps per second (default: %(default)s)")
+    add("--seconds", type=float, default=10.0, help="seconds of the episode (default: %(default)s)")
+    add("--camera", action="store_true", help="show the policy the goal only by a camera")
+    add("--decision", type=float, default=0.0, help="extra seconds per decision (default: %(default)s)")
+    add("--unplug", type=float, default=math.inf, help="seconds until the robot stops answering")
+    add("--iterations", type=int, default=300, help="iterations of the training (default: %(default)s)")
     options = parser.parse_args(argv)
-    torch.set_num_threads(1)  # the loop needs a core of its own
+    torch.set_num_threads(1)  # leave a core to the loop
     policy = trained(options.camera, options.rate, options.iterations)  # yours: load_policy("policies/...")
     policy.register_forward_pre_hook(lambda module, inputs: time.sleep(options.decision))
     robot = SimulatedArm(options.camera, options.unplug)

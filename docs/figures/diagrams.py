@@ -1,4 +1,4 @@
-"""The flowchart of the page on sources, and the timeline of the page on concepts.
+"""Draw the flowchart of the page on sources, and the timeline of the page on concepts.
 
 python docs/figures/diagrams.py    # or: make results; writes docs/_static
 """
@@ -21,17 +21,17 @@ QUESTIONS = (
 
 
 def canvas(width: float, height: float) -> tuple[Figure, Axes]:
-    """A picture in units of a tenth of an inch, without axes."""
-    made = Figure(figsize=(width, height))
-    axis = made.add_axes((0, 0, 1, 1), xlim=(0, 10 * width), ylim=(0, 10 * height))
+    """Return an empty picture in units of a tenth of an inch, without axes."""
+    picture = Figure(figsize=(width, height))
+    axis = picture.add_axes((0, 0, 1, 1), xlim=(0, 10 * width), ylim=(0, 10 * height))
     axis.axis("off")
-    return made, axis
+    return picture, axis
 
 
 def box(
     axis: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **style: object
 ) -> None:
-    """A rectangle with its text, around a place."""
+    """Draw a rectangle with its text, centred at a place."""
     (x, y), (width, height) = place, size
     colors = {"fc": style.get("fc", "white"), "ec": style.get("ec", "0.3")}
     axis.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, lw=1.2, **colors))
@@ -39,8 +39,8 @@ def box(
 
 
 def flowchart() -> None:
-    """Chart H: which source to take."""
-    made, axis = canvas(6.4, 4.6)
+    """Draw chart H: the choice of a source."""
+    picture, axis = canvas(6.4, 4.6)
     left, right, step, top = 17.0, 51.0, 9.2, 41.4
     for k, (question, answer, color) in enumerate(QUESTIONS):
         y = top - step * k
@@ -60,13 +60,13 @@ def flowchart() -> None:
         ec=BLUE,
         color="white",
     )
-    made.savefig(OUT / "which_source.svg", **SVG)
+    picture.savefig(OUT / "which_source.svg", **SVG)
 
 
 def timeline() -> None:
-    """Chart I: what each source knows when chunk B is decided."""
-    made, axis = canvas(6.0, 3.9)
-    start, unit = 14.2, 1.84  # where step 0 is, and how wide a step
+    """Draw chart I: the source of chunk B for each prior."""
+    picture, axis = canvas(6.0, 3.9)
+    start, unit = 14.2, 1.84  # position of step 0, and width of a step
 
     def bar(row: float, first: int, last: int, text: str, **style: object) -> None:
         width = unit * (last - first)
@@ -89,7 +89,7 @@ def timeline() -> None:
     bar(7, 0, 8, "forecast\nwith A", fc=LIGHT)
     bar(7, 8, 16, "mean: forecast,\nwidth 1", fc=ORANGE, ec=ORANGE, color="white")
     bar(7, 16, 24, "cold: mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
-    made.savefig(OUT / "timeline.svg", **SVG)
+    picture.savefig(OUT / "timeline.svg", **SVG)
 
 
 if __name__ == "__main__":

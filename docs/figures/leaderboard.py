@@ -1,11 +1,11 @@
-"""The leaderboard: which method solves most on human demonstrations, at how many network evaluations.
+"""Draw and write the leaderboard: success of methods on human demonstrations, by NFE.
 
-The README's table has its means next to those of scripted demonstrations.
+The README's table has its means next to those on scripted demonstrations.
 
 PYTHONPATH=benchmarks python docs/figures/leaderboard.py    # or: make results; writes a picture and a table
 
-Intervals are of 95%, from a bootstrap over training seeds and episodes. A rank is that among all lines of the
-table, and its interval is of the same bootstrap.
+95% intervals are from a bootstrap over training seeds and episodes. A rank is among all lines of the table,
+and its interval is from the same bootstrap.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lab.statistics import resampled_means
 
 PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
 DOOR = "door, 25"
-FAMILIES = {  # human demonstrations and how many, and the rows of their runs
+FAMILIES = {  # human demonstrations and their number, and the rows of their runs
     DOOR: "door_20000",
     "Push-T, 25": "pusht_25",
     "Push-T, 50": "pusht_50",
@@ -45,24 +45,24 @@ FAMILIES = {  # human demonstrations and how many, and the rows of their runs
 
 
 def _played(family: str) -> DataFrame:
-    """The rows of a family's runs with the noise that the source was trained with; MIP's is none."""
+    """Return the rows of a family's runs at the noise that the source was trained with; MIP's is 0."""
     rows = read_played(FAMILIES[family]).assign(family=family)
     return rows[rows["noise"] == rows.groupby("source")["noise"].transform("max")]
 
 
 def pairs() -> DataFrame:
-    """Episodes won and lost of the Gaussian source's with the same NFE, over all families."""
+    """Return episodes won and lost against the Gaussian source at the same NFE, over all families."""
     rows = _played(DOOR)
     both = rows.merge(rows[rows["source"] == GAUSSIAN], on=["seed", "nfe"], suffixes=("", "_base"))
     for ahead, name in (1, "won"), (-1, "lost"):
         differences = both["solved"] - both["solved_base"]
         both[name] = [(ahead * difference > 0).sum() for difference in differences]
-    known = concat([read("pusht").dropna(subset=["won"]), both[both["source"] != GAUSSIAN]])
-    return known.groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
+    counts = concat([read("pusht").dropna(subset=["won"]), both[both["source"] != GAUSSIAN]])
+    return counts.groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
 
 
 def trials() -> DataFrame:
-    """The episodes that each training solved with the source's own noise, a row per seed and NFE."""
+    """Return the episodes that each training solved at the source's own noise, a row per seed and NFE."""
     pusht = read("pusht")
     pusht = pusht.assign(
         family="Push-T, " + pusht["demonstrations"].astype(str), rate=pusht["seed_success"].str.split()
@@ -75,7 +75,7 @@ def trials() -> DataFrame:
 
 
 def standings() -> DataFrame:
-    """Success per method and NFE in percent, by family and in the mean, with ranks and intervals."""
+    """Return success per method and NFE in percent, by family and on average, with ranks and intervals."""
     rng, lines, draws = np.random.default_rng(0), [], []
     for (source, nfe), part in trials().groupby(["source", "nfe"]):
         families = {name: group for name, group in part.groupby("family")}
@@ -96,9 +96,9 @@ def standings() -> DataFrame:
 
 
 def draw() -> None:
-    """The mean over families against the number of network evaluations."""
+    """Draw the mean over families against the number of network evaluations."""
     frame = standings()
-    made, (axis,) = figure(WIDTH, 4.6, 1, "Human demonstrations: the mean of four sets")
+    picture, (axis,) = figure(WIDTH, 4.6, 1, "Human demonstrations: the mean of four sets")
     for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
         part = frame[frame["source"] == source].sort_values("nfe")
         if len(part):
@@ -109,11 +109,11 @@ def draw() -> None:
     axis.set(xscale="log", ylim=(0, None))
     axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])
     axis.minorticks_off()
-    save(made, "leaderboard")
+    save(picture, "leaderboard")
 
 
 def table() -> str:
-    """The standings, in Markdown."""
+    """Return the standings in Markdown."""
     names, won_and_lost = ("mean", *FAMILIES), pairs()
     text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | trainings |"]
     text.append("|---" * (5 + len(names)) + "|")
@@ -130,7 +130,7 @@ def table() -> str:
     return "\n".join(text) + "\n"
 
 
-SHORT = {  # settings of docs/results/means.csv, as the README calls them
+SHORT = {  # names in the README for settings of docs/results/means.csv
     "10: square, can and stack": "scripted, 10",
     "25: square, can and stack": "scripted, 25",
     "150 or 300: all eight settings": "scripted, 150 or 300",
@@ -138,7 +138,7 @@ SHORT = {  # settings of docs/results/means.csv, as the README calls them
 
 
 def readme_table() -> str:
-    """Success of four sources on human and scripted demonstrations, in Markdown."""
+    """Return success of four sources on human and scripted demonstrations in Markdown."""
     sources = (GAUSSIAN, PAST, PREVIEW, CORRELATED)
     people = standings().assign(name="human", success=lambda frame: frame["mean"])
     scripted = read("means").assign(name=lambda frame: frame["setting"].map(SHORT))
@@ -156,7 +156,7 @@ def readme_table() -> str:
 
 
 def tables() -> dict[Path, str]:
-    """The table that each page marks."""
+    """Return the table of each page."""
     return {PAGE: table(), README: readme_table()}
 
 

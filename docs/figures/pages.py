@@ -1,4 +1,4 @@
-"""The tables that pages mark: one of their own, and one per run whose rows they name."""
+"""Tables in pages: the marked one of a page, and one per run whose rows it names."""
 
 from __future__ import annotations
 
@@ -12,19 +12,17 @@ from shared import GAUSSIAN, SOURCES, read_played
 from lab.statistics import chosen_elsewhere
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the marked table of a page."""
 
-"""This matches the table of a page that has one."""
 PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-
-
 """This matches the table of a run's rows in a page."""
 
 
 def played_table(name: str) -> str:
-    """Success of the rows of a run, in Markdown: percent, and episodes won and lost of the Gaussian source's.
+    """Return success of a run in Markdown: percent, and episodes won and lost against the Gaussian source.
 
-    A line per NFE and factor of the source's noise, and per NFE one in which every source has its own best
-    factor, chosen on other episodes. Seeds are taken together.
+    There is a line per NFE and factor of the source's noise, and per NFE a line in which every source has its
+    own best factor, chosen on other episodes. Seeds are pooled.
     """
     rows = read_played(name)
     names = [source for source in SOURCES if source in set(rows["source"])]
@@ -48,24 +46,25 @@ def played_table(name: str) -> str:
 
 
 def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: list[str]) -> str:
-    most, base, cells = max(each.mean() for each in solved.values()), solved.get(GAUSSIAN), []
+    most, gaussian = max(outcomes.mean() for outcomes in solved.values()), solved.get(GAUSSIAN)
+    entries = []
     for source in names:
-        mine = solved.get(source)
-        if mine is None:
-            cells.append("")
+        outcomes = solved.get(source)
+        if outcomes is None:
+            entries.append("")
             continue
-        rate = f"{100 * mine.mean() + 1e-6:.0f}"
-        rate = f"**{rate}**" if mine.mean() == most else rate
-        if source != GAUSSIAN and base is not None and len(mine) == len(base):
-            rate += f" ({(mine > base).sum()} : {(mine < base).sum()})"
-        cells.append(rate)
-    return f"| {nfe} | {noise} | " + " | ".join(cells) + " |"
+        rate = f"{100 * outcomes.mean() + 1e-6:.0f}"
+        rate = f"**{rate}**" if outcomes.mean() == most else rate
+        if source != GAUSSIAN and gaussian is not None and len(outcomes) == len(gaussian):
+            rate += f" ({(outcomes > gaussian).sum()} : {(outcomes < gaussian).sum()})"
+        entries.append(rate)
+    return f"| {nfe} | {noise} | " + " | ".join(entries) + " |"
 
 
 def with_tables(page: str, text: str) -> str:
-    """A page with its table, and those of the runs whose rows it names."""
+    """Return a page with its table, and the tables of the runs whose rows it names."""
     page = TABLE.sub(lambda _: text, page)
-    return PLAYED.sub(lambda found: f"{found[1]}{found[2]}{played_table(found[1])}", page)
+    return PLAYED.sub(lambda match: f"{match[1]}{match[2]}{played_table(match[1])}", page)
 
 
 def write(pages: Mapping[Path, str]) -> None:

@@ -1,10 +1,11 @@
-"""The charts and the table of the results page, from the numbers in docs/results.
+"""Draw the charts and write the tables of the results pages, from the numbers in docs/results.
 
 PYTHONPATH=benchmarks python docs/figures/results.py    # or: make results; writes docs/_static/results and
                                                         # three pages' tables
 
-An interval is of 95%. A success rate has Wilson's score interval, a difference of two Newcombe's. Both take
-the episodes of all seeds as independent; training seeds differ by more than that, paired episodes by less.
+Intervals are 95%: Wilson's score interval of a success rate, Newcombe's of a difference. Both treat the
+episodes of all seeds as independent; the true spread is larger over training seeds, and smaller for paired
+episodes.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ PAGE = DOCS / "results.md"
 
 
 def gain(row: Series, base: Series) -> tuple[float, float, float]:
-    """The difference to the base in points, and how far its interval reaches down and up."""
+    """Return the difference to the Gaussian source in points, and the lengths of its error bar."""
     a, b = row["success"], base["success"]
     (low, high), (base_low, base_high) = wilson(a, row["total"]), wilson(b, base["total"])
     return a - b, np.hypot(a - low, base_high - b), np.hypot(high - a, b - base_low)
 
 
 def gains() -> DataFrame:
-    """Success minus the Gaussian source's at one step: settings, and means of settings."""
+    """Return success minus the Gaussian source's at one step, in settings and on average."""
     settings, means = read("one_step"), read("means")
     names = (
         settings["task"]
@@ -58,19 +59,19 @@ def gains() -> DataFrame:
         + " of "
         + settings["style"].map(OPERATORS)
     )
-    found = []
+    rows_of_chart = []
     for rows, name in (settings, names), (means, "mean of " + means["setting"]):
         for setting, group in rows.groupby(name, sort=False):
             base = group[group["source"] == GAUSSIAN].iloc[0]
             for _, row in group[group["source"] != GAUSSIAN].iterrows():
-                found.append([setting, row["source"], *gain(row, base)])
-    return DataFrame(found, columns=["setting", "source", "gain", "down", "up"])
+                rows_of_chart.append([setting, row["source"], *gain(row, base)])
+    return DataFrame(rows_of_chart, columns=["setting", "source", "gain", "down", "up"])
 
 
 def one_step() -> None:
-    """Chart A: gains at one step."""
+    """Draw chart A: gains at one step."""
     frame = gains()
-    made, (axis,) = figure(WIDTH, 10.5, 1, "Success at one step, minus that of the Gaussian source")
+    picture, (axis,) = figure(WIDTH, 10.5, 1, "Success at one step, minus that of the Gaussian source")
     names, order = list(dict.fromkeys(frame["setting"])), []
     for keys in (", 150", ", 300", "of 150"), (", 25", "of 25"), (", 10 ", "of 10"), ("of all",):
         order += [name for key in keys for name in names if key in name]
@@ -88,11 +89,11 @@ def one_step() -> None:
     axis.set_ylim(len(order) - 0.5, -0.5)
     axis.set_xlabel("difference in points, with its 95% interval")
     axis.grid(axis="x", color="0.9")
-    save(made, "one_step")
+    save(picture, "one_step")
 
 
 def steps() -> None:
-    """Chart B: success against the number of integration steps."""
+    """Draw chart B: success against the number of integration steps."""
     rows = read("steps")
     many, two = rows["demonstrations"] >= 150, rows["task"] == "transport"
     parts = {
@@ -101,18 +102,18 @@ def steps() -> None:
         "25 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 25],
         "10 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 10],
     }
-    made, axes = figure(WIDTH, 6.6, 2, "Success against the number of integration steps", rows=2)
+    picture, axes = figure(WIDTH, 6.6, 2, "Success against the number of integration steps", rows=2)
     for axis, (name, part) in zip(axes, parts.items(), strict=True):
         lines(axis, part, "nfe", [1, 3, 9])
         finish(axis, name, xlabel="integration steps (NFE)")
-    made.supylabel("success in percent, 95% interval", fontsize=10)
-    save(made, "steps")
+    picture.supylabel("success in percent, 95% interval", fontsize=10)
+    save(picture, "steps")
 
 
 def demonstrations() -> None:
-    """Chart C: success against demonstrations, with a dot per seed."""
+    """Draw chart C: success against demonstrations, with a dot per seed."""
     rows = read("one_step")
-    made, axes = figure(WIDTH, 8, 1, "Success at one step against demonstrations (dots: seeds)", rows=3)
+    picture, axes = figure(WIDTH, 8, 1, "Success at one step against demonstrations (dots: seeds)", rows=3)
     for axis, task in zip(axes, ("square", "can", "stack"), strict=True):
         part = rows[(rows["task"] == task) & (rows["style"] == "ph")]
         lines(axis, part, "demonstrations", [10, 25, 150], interval=False)
@@ -121,12 +122,12 @@ def demonstrations() -> None:
             place = row["demonstrations"] * (1 + 0.07 * (list(SOURCES).index(row["source"]) - 1))
             axis.plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
         finish(axis, task, xlabel="demonstrations of one operator")
-    made.supylabel("success in percent", fontsize=10)
-    save(made, "demonstrations")
+    picture.supylabel("success in percent", fontsize=10)
+    save(picture, "demonstrations")
 
 
 def iterations() -> None:
-    """Chart D: success against the length of the training."""
+    """Draw chart D: success against the length of the training."""
     rows = read("iterations")
     six = rows["style"] == "mh"
     parts = {
@@ -134,32 +135,32 @@ def iterations() -> None:
         "square, six operators (three seeds)": rows[six & (rows["task"] == "square")],
         "square, one operator, the paper's loss\n(one seed, two at 20,000)": rows[~six],
     }
-    made, axes = figure(WIDTH, 8.4, 1, "Success at one step against the length of the training", rows=3)
+    picture, axes = figure(WIDTH, 8.4, 1, "Success at one step against the length of the training", rows=3)
     for axis, (name, part) in zip(axes, parts.items(), strict=True):
         lines(axis, part, "iterations", [2_500, 5_000, 10_000, 20_000])
         finish(axis, name, xlabel="training iterations of batch 128", xlim=(2_100, 24_000))
-    made.supylabel("success in percent, 95% interval", fontsize=10)
-    save(made, "iterations")
+    picture.supylabel("success in percent, 95% interval", fontsize=10)
+    save(picture, "iterations")
 
 
 def memory() -> None:
-    """Chart E: success against how much of the past the actions follow."""
+    """Draw chart E: success against memory gain."""
     rows = read("memory")
     each = rows["memory_gain"].astype(str).str.split()
     rows = rows.assign(gain=each.map(lambda values: np.mean([float(n) for n in values])))
-    made, axes = figure(WIDTH, 7.6, 1, "Success against how much of the past the actions follow", rows=2)
+    picture, axes = figure(WIDTH, 7.6, 1, "Success against how much of the past the actions follow", rows=2)
     for axis, task in zip(axes, ("square", "transport"), strict=True):
         for _, row in rows[rows["task"] == task].iterrows():
             label, color, mark = SOURCES[row["source"]]
             axis.plot(row["gain"], row["success"], mark, ms=8, alpha=0.85, color=color, label=label)
-        what = "memory gain: the part of a shift of the past that reappears in the actions"
+        what = "memory gain (0: past ignored, 1: past copied)"
         finish(axis, f"{task}, 300 demonstrations of six operators", xlabel=what, ylim=(-4, 100))
-    made.supylabel("success in percent", fontsize=10)
-    save(made, "memory")
+    picture.supylabel("success in percent", fontsize=10)
+    save(picture, "memory")
 
 
 def noise() -> None:
-    """Chart F: residual noise, white and correlated."""
+    """Draw chart F: gains against residual noise, white and correlated."""
     rows = read("noise")
     kept = rows["sigma"] * np.sqrt(rows["correlation"] + (1 - rows["correlation"]) / 8)
     rows = rows.assign(kept=kept)
@@ -169,7 +170,7 @@ def noise() -> None:
         "WP-Past, four settings (two or three seeds)": rows[few],
         "WP-Preview, square (one seed)": rows[~few],
     }
-    made, axes = figure(WIDTH, 11, 1, "Success against the noise around the mean, at one step", rows=3)
+    picture, axes = figure(WIDTH, 11, 1, "Success against the noise around the mean, at one step", rows=3)
     for axis, (name, part), warm in zip(axes, parts.items(), (PAST, PAST, PREVIEW), strict=True):
         keys = ["task", "demonstrations", "style", "actions"]
         for k, (setting, group) in enumerate(part.groupby(keys, sort=False)):
@@ -187,25 +188,25 @@ def noise() -> None:
         axis.axhline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
         finish(axis, name, xlabel="noise that averaging over a chunk leaves", xlim=(0, None))
         axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
-    made.supylabel("success minus the Gaussian source's, in points", fontsize=10)
-    made.savefig(OUT / "noise.svg", **SVG)
+    picture.supylabel("success minus the Gaussian source's, in points", fontsize=10)
+    picture.savefig(OUT / "noise.svg", **SVG)
 
 
 def actions() -> None:
-    """Chart G: deltas and poses."""
+    """Draw chart G: deltas and absolute poses."""
     rows = read("actions")
-    made, axes = figure(WIDTH, 6.6, 2, "Deltas and absolute poses, at one step (one seed)", rows=2)
+    picture, axes = figure(WIDTH, 6.6, 2, "Deltas and absolute poses, at one step (one seed)", rows=2)
     for axis, (setting, part) in zip(axes, rows.groupby(["task", "style"], sort=False), strict=True):
         for source, group in part.groupby("source", sort=False):
             label, color, mark = SOURCES[source]
             axis.plot(group["actions"], group["success"], mark + "-", color=color, label=label)
         finish(axis, f"{setting[0]}, {OPERATORS[setting[1]]}", ylim=(-3, 103), xlim=(-0.3, 1.3))
-    made.supylabel("success in percent of 50 episodes", fontsize=10)
-    save(made, "actions")
+    picture.supylabel("success in percent of 50 episodes", fontsize=10)
+    save(picture, "actions")
 
 
 def human_table() -> str:
-    """Score and success on human demonstrations of Push-T, in Markdown."""
+    """Return score and success on human demonstrations of Push-T in Markdown."""
     rows = read("pusht")
     names = [source for source in SOURCES if source in set(rows["source"])]
     text = ["| demonstrations | steps | " + " | ".join(SOURCES[name][0] for name in names) + " |"]
@@ -222,7 +223,7 @@ def human_table() -> str:
 
 
 def table() -> str:
-    """Success at one step, in Markdown."""
+    """Return success at one step in Markdown."""
     rows = read("means").pivot(index="setting", columns="source", values="success")
     rows = rows.reindex(index=read("means")["setting"].unique(), columns=list(SOURCES)[:5])
     text = [
@@ -238,7 +239,7 @@ def table() -> str:
 
 
 def papers_settings() -> DataFrame:
-    """Success in settings of the paper's Table 1, from the state: a row per training, NFE and source."""
+    """Return success in the state settings of the paper's Table 1, a row per training, NFE and source."""
     longest = read_json(DATA / "square_mh_80000.jsonl", lines=True)
     plain = (longest["options"] == "") & (longest["sigma"] == longest["prior"].map(PAPER_DEFAULT_SIGMA))
     longest = longest[plain].rename(columns={"data": "style", "prior": "source"})
@@ -249,12 +250,12 @@ def papers_settings() -> DataFrame:
     steps, longer = read("steps"), read("iterations")
     steps = steps[steps["demonstrations"] >= 150]
     longer = longer[(longer["iterations"] > 10_000) & (longer["weighting"] == "standardised")]
-    # A training with more seeds has those of the one with fewer.
+    # The training with more seeds includes those of the one with fewer.
     return concat([steps, longer, longest]).sort_values("seeds").drop_duplicates(keys, keep="last")
 
 
 def paper_table() -> str:
-    """The paper's Table 1 beside these rows, in Markdown: success at NFE 9 / 3 / 1."""
+    """Return the paper's Table 1 and these rows in Markdown: success at NFE 9 / 3 / 1."""
 
     def line(title: str, place: str, rates: Mapping[tuple[str, int], float]) -> str:
         each = [
@@ -265,11 +266,13 @@ def paper_table() -> str:
 
     text = ["| | | Gaussian source | WP-Past | WP-Preview |", "|---|---|---|---|---|"]
     rows = papers_settings()
-    for (task, style, seen), paper in PAPER_SUCCESS.items():
+    for (task, style, observations), paper in PAPER_SUCCESS.items():
         ours = rows[(rows["task"] == task) & (rows["style"] == style)]
-        if seen == STATE and len(ours):
-            known = {(source, nfe): rate for source, rates in paper.items() for nfe, rate in rates.items()}
-            text.append(line(f"{task} {style}", "the paper", known))
+        if observations == STATE and len(ours):
+            published = {
+                (source, nfe): rate for source, rates in paper.items() for nfe, rate in rates.items()
+            }
+            text.append(line(f"{task} {style}", "the paper", published))
             for iterations, part in ours.groupby("iterations"):
                 seeds = {1: "1 seed"}.get(part["seeds"].max(), f"{part['seeds'].max()} seeds")
                 rates = dict(zip(zip(part["source"], part["nfe"], strict=True), part["success"], strict=True))
@@ -278,7 +281,7 @@ def paper_table() -> str:
 
 
 def tables() -> dict[Path, str]:
-    """The table that each page marks."""
+    """Return the table of each page."""
     return {PAGE: table(), DOCS / "notes" / "evidence.md": human_table(), DOCS / "paper.md": paper_table()}
 
 

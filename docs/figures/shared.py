@@ -1,4 +1,4 @@
-"""The stored rows, the names and colours of sources, and the look of a chart, for all charts and tables."""
+"""The stored rows, the names and colours of sources, and the style of charts, for all charts and tables."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, read_csv, read_json
 
-matplotlib.rcParams["svg.hashsalt"] = "warmprior"  # the same file every time
-SVG = {"metadata": {"Date": None}}  # and without the day
+matplotlib.rcParams["svg.hashsalt"] = "warmprior"  # reproducible files
+SVG = {"metadata": {"Date": None}}
 
 DOCS = Path(__file__).parents[1]
 DATA, OUT = DOCS / "results", DOCS / "_static" / "results"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
 CORRELATED, WIDE = "past,correlation=0.5", "past,sigma=1"
-SOURCES = {  # what a chart calls them, in which colour and with which mark
+SOURCES = {  # label, colour and marker in charts
     GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
     PAST: ("WP-Past", "#1f77b4", "o"),
     PREVIEW: ("WP-Preview", "#d95f02", "o"),
@@ -26,29 +26,29 @@ SOURCES = {  # what a chart calls them, in which colour and with which mark
     "preview,correlation=0.5": ("WP-Preview, correlated noise", "#e6ab02", "o"),
     "ot": ("OT-CFM", "0.2", "s"),
     "cvae": ("learned, autoencoder", "0.2", "^"),
-    "leap": ("learned, of the observation", "0.2", "v"),
+    "leap": ("learned, from the observation", "0.2", "v"),
     "step,start_time=0.5": ("STEP", "0.2", "D"),
     "history": ("history conditioning", "0.2", "P"),
-    "a2a": ("learned, of the last actions", "0.2", "X"),
-    "forecast": ("learned, of both", "0.2", "*"),
+    "a2a": ("learned, from the last actions", "0.2", "X"),
+    "forecast": ("learned, from both", "0.2", "*"),
     "regression": ("regression", "0.2", "p"),
     "mip": ("MIP", "#a6761d", "s"),
     "mip-past": ("MIP, WP-Past", "#a6761d", "D"),
     "mip-past,correlation=0.5": ("MIP, WP-Past, correlated noise", "#a6761d", "P"),
 }
-WIDTH = 5.6  # of a picture, in inches: readable on a screen of 400 pixels
+WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 OPERATORS = {"ph": "one operator", "mh": "six operators"}
 
 
 def read(name: str) -> DataFrame:
-    """The rows of one file, with the number of episodes that each stands for."""
+    """Return the rows of a file, with the number of episodes of each."""
     rows = read_csv(DATA / f"{name}.csv", comment="#")
     tasks = rows["settings"] if "settings" in rows else rows["task"].str.split().str.len()
     return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
 
 
 def read_played(name: str) -> DataFrame:
-    """The rows of a run, with their source, the factor of its noise, and the outcome of every episode."""
+    """Return the rows of a run, with source, factor of its noise, and the outcome of every episode."""
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     options = rows["options"].where(rows["options"] == "", "," + rows["options"])
     rows = rows.assign(source=rows["prior"] + options, noise=rows.get("temperature", Series(1.0, rows.index)))
@@ -56,39 +56,39 @@ def read_played(name: str) -> DataFrame:
 
 
 def wilson(success: float, total: float) -> np.ndarray:
-    """Lower and upper end of a success rate's interval, in percent."""
+    """Return the lower and upper end of a success rate's interval in percent."""
     p, z2 = success / 100, 1.96**2 / total
     half = np.sqrt(p * (1 - p) * z2 + z2**2 / 4)
     return 100 * (p + z2 / 2 + np.array([-half, half])) / (1 + z2)
 
 
 def figure(width: float, height: float, columns: int, title: str, rows: int = 1) -> tuple[Figure, list[Axes]]:
-    """A picture with a title that says what it shows, and its axes."""
-    made = Figure(figsize=(width, height), layout="constrained")
-    made.suptitle(title, fontsize=11.5, fontweight="bold")
-    return made, list(made.subplots(rows, columns, squeeze=False).flat)
+    """Return a picture with a title, and its axes."""
+    picture = Figure(figsize=(width, height), layout="constrained")
+    picture.suptitle(title, fontsize=11.5, fontweight="bold")
+    return picture, list(picture.subplots(rows, columns, squeeze=False).flat)
 
 
-def save(made: Figure, name: str, columns: int = 2) -> None:
-    """Write the picture, with one legend below."""
-    shown = [pair for axis in made.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
+def save(picture: Figure, name: str, columns: int = 2) -> None:
+    """Write the picture with one legend below."""
+    shown = [pair for axis in picture.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in reversed(shown)}
     labels = sorted(handles, key=[label for _, label in shown].index)
-    made.legend(
+    picture.legend(
         [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, frameon=False
     )
-    made.savefig(OUT / f"{name}.svg", **SVG)
+    picture.savefig(OUT / f"{name}.svg", **SVG)
 
 
 def finish(axis: Axes, title: str, **settings: object) -> None:
-    """Title, labels and a faint grid."""
+    """Set title, labels and a faint grid."""
     axis.set_title(title, fontsize=10.5)
     axis.set(**settings)
     axis.grid(axis="y", color="0.9")
 
 
 def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool = True) -> None:
-    """Success against a column, a line per source."""
+    """Draw success against a column, a line per source."""
     for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
         part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
         if len(part):

@@ -1,8 +1,8 @@
-"""One GIF from several videos of the same episode, each under its name.
+"""Join several videos of the same episode to a GIF, each below its name.
 
 python docs/figures/side_by_side.py docs/_static/door.gif "Gaussian source=gaussian.mp4" "WP-Past=past.mp4"
 
-It plays at a third of the speed. A video that ends before the others stays at its last picture.
+It plays at a third of real speed. A video that ends before the others keeps its last picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BAR = 30  # height of the names, in pixels
 
 
 def pictures(path: Path) -> list[Image.Image]:
-    """The video, slowed down, at :data:`RATE` pictures per second."""
+    """Return the pictures of the slowed video, :data:`RATE` per second."""
     av = require("av", "lerobot")
     with av.open(str(path)) as video:
         rate = float(video.streams.video[0].average_rate)

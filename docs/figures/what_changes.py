@@ -1,4 +1,4 @@
-"""The picture of README and landing page: three sources, their flows, what is executed.
+"""Draw the picture of the landing page: three sources, their flows, and executed paths.
 
 PYTHONPATH=benchmarks python docs/figures/what_changes.py
 
@@ -25,16 +25,16 @@ from warmprior.training import train_policy
 OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
 ABOVE, BELOW = "#1f77b4", "#d95f02"
 SOURCES = {
-    "Gaussian noise": GaussianPrior(16),
+    "Gaussian source": GaussianPrior(16),
     "WP-Past: what was just executed": PastPrior(16),
     "WP-Preview: its own earlier forecast": PreviewPrior(16),
 }
 AHEAD = 4
-"""The coordinate of the chunk that is shown."""
+"""Position of the chunk that is shown."""
 
 
 def main() -> None:
-    """Train, and draw."""
+    """Train the policies, and draw."""
     options, task = NAVIGATION_PRESETS["quick"], navigation_task()
     data = SharedObservations(task.data, 16)
     figure, axes = new_figure(11.0, 5.4, 2, 3)
@@ -42,12 +42,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for column, (name, prior) in enumerate(SOURCES.items()):
             place = Path(folder) / prior.name
-            # Nothing is withheld from a source that remembers nothing.
+            # The Gaussian source reads no history, so none is withheld.
             withheld = options.training.cold_probability if column else 0.0
             training = replace(options.training, cold_probability=withheld)
             actor = train_policy(task, prior, place, network=options.network, training=training)
             window = data.windows(actor.prior)
-            # Of a demonstration that passes above the first obstacle, while it does.
+            # A window of a demonstration, above the first obstacle.
             index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
             batch = window[index : index + 1].expand(160).contiguous()
             generator = torch.Generator().manual_seed(0)
