@@ -1,4 +1,4 @@
-"""Policies from the command line: ``python -m warmprior evaluate FOLDER --episodes 50 --nfe 1``."""
+"""Train, evaluate and publish policies: python -m warmprior evaluate FOLDER --episodes 50 --nfe 1."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def info(args: argparse.Namespace) -> None:
 
 
 def evaluate(args: argparse.Namespace) -> None:
-    """Play episodes with a saved policy; no dataset is needed."""
+    """Play episodes with a saved policy, without a dataset."""
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
@@ -107,7 +107,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 
 def push(args: argparse.Namespace) -> None:
-    """Send a saved policy to the Hugging Face hub, with a model card."""
+    """Upload a saved policy to the Hugging Face hub, with a model card."""
     from warmprior.training.card import model_card
     from warmprior.training.saved import check_repository, push_policy
 
@@ -136,27 +136,28 @@ class Train:
     PLACE is a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME.
 
     Attributes:
-        network: the velocity network.
-        training: the recipe.
-        prior: the source (gaussian, past, preview, or package.module:Class of your own); options follow as in
-            past,sigma=0.3.
-        chunk: chunk length H.
-        nfe: network evaluations per chunk, saved with the policy.
-        observation_keys: observations that policies see, in this order (default: the task's).
-        joint_key: the observation whose numbers the actions set, such as observation.state.
-        image_keys: images that they see, in addition to the robot's state, such as agentview_image.
-        fast_rendering: robosuite's images have no reflections, shadows and smooth edges.
-        actions: the policies' actions: as recorded, or the absolute poses that robosuite's deltas target.
-        mask: a mask of the file, such as train.
-        demonstrations: number of demonstrations, from the first on (default: all).
-        held_out: number of last demonstrations to leave out, and to measure the error of actions on (default:
-            a tenth if no environment is known, else none).
-        task: task of robosuite, for a LeRobotDataset that does not describe its environment.
+        network: options of the velocity network
+        training: options of the recipe
+        prior: source (gaussian, past, preview, or package.module:Class of your own), with options as in
+            past,sigma=0.3
+        chunk: chunk length H
+        nfe: network evaluations per chunk, saved with the policy
+        observation_keys: observations of the policy, in this order (default: the task's)
+        joint_key: observation of the joint positions that absolute actions target, such as
+            observation.state
+        image_keys: images of the policy, in addition to the robot's state, such as agentview_image
+        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
+        actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
+        mask: mask of the file, such as train, whose demonstrations to use (default: all)
+        demonstrations: number of demonstrations, from the first on (default: all)
+        held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
+            tenth if no environment is known, else none)
+        task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit (default: ph, and human
-            outside robosuite).
-        horizon: control steps per episode (default: the environment's own, or robosuite's for the style).
-        out: folder of the trainings (default: policies); an interrupted one continues.
-        device: device of the network, such as cuda.
+            outside robosuite)
+        horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
+        out: folder of trainings, in which an interrupted one continues (default: policies)
+        device: device of the network, such as cuda
     """
 
     network: NetworkOptions
@@ -215,7 +216,7 @@ def train(args: argparse.Namespace) -> None:
         try:
             whole.check_environment()  # an error is better raised before the training
         except ImportError as missing:
-            print(f"the training goes on, but no episodes can be played here: {missing}")
+            print(f"no episodes can be played here, so the policy is only trained: {missing}")
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
     task, left_out = whole.split(tenth if options.held_out is None else options.held_out)
@@ -237,14 +238,14 @@ def train(args: argparse.Namespace) -> None:
         spread = float(left_out["action"].var(0, correction=0).mean())
         number = count - task.facts["demonstrations"]
         print(
-            f"on the {number} demonstrations that were left out, mean squared errors of normalised actions, "
-            f"which range from -1 to 1 (their mean as every action: {spread:.4f}):"
+            f"mean squared error of normalised actions (from -1 to 1) on {number} held-out demonstrations; "
+            f"the mean action has {spread:.4f}:"
         )
         steps = options.network.observation_steps
         for nfe, error in errors_of(actor, left_out, steps, (1, 3, 9, options.nfe)).items():
             print(f"  NFE {nfe}: {error:.4f}")
     if whole.environment is not None:
-        print(f"play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
+        print(f"to play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
     print(saved)
 
 
@@ -279,7 +280,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
     written = f"warmprior {version('warmprior')}"
-    parser.add_argument("--version", action="version", version=written, help="print it, and end")
+    parser.add_argument("--version", action="version", version=written, help="print the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(run: Callable[[argparse.Namespace], None]) -> Callable[..., Any]:
@@ -290,17 +291,17 @@ def make_parser() -> argparse.ArgumentParser:
     for run in (info, push, evaluate):
         add = command(run)
         place = "" if run is push else ", or user/name of a repository at the Hugging Face hub"
-        add("folder", help=f"written by save_policy, such as .../policy_010000{place}")
+        add("folder", help=f"folder of the saved policy, such as .../policy_010000{place}")
         if run is push:
-            add("repository", help="user/name; made if needed")
+            add("repository", help="user/name of the repository, created if needed")
             add(
                 "--card",
                 type=Path,
-                help="text of the card, such as benchmarks/card.py writes (default: made here)",
+                help="file with the model card, as benchmarks/card.py writes it (default: generated)",
             )
-            add("--private", action="store_true", help="if it is made")
-            add("--licence", help="of the policy, as the hub calls it, such as mit")
-            add("--dry-run", action="store_true", help="print the card, and send nothing")
+            add("--private", action="store_true", help="make the repository private if it is created")
+            add("--licence", help="licence of the policy in the hub's spelling, such as mit")
+            add("--dry-run", action="store_true", help="print the card and upload nothing")
         add("--revision", help="branch, tag or commit of the repository (default: main)")
         add(
             "--import",
@@ -308,41 +309,51 @@ def make_parser() -> argparse.ArgumentParser:
             action="append",
             default=[],
             metavar="MODULE",
-            help="where your own prior, start point or network is defined; may be repeated",
+            help="module that defines your own prior, start point or network; may be repeated",
         )
     from warmprior.envs.tasks import EVALUATION_SEED
 
-    add("--episodes", type=int, default=50, help="how many (%(default)s)")
+    add("--episodes", type=int, default=50, help="number of episodes (default: %(default)s)")
     add(
         "--nfe",
         type=int,
         nargs="+",
-        help="network evaluations per chunk, one or several (default: the policy's)",
+        help="network evaluations per chunk, one or several values (default: the policy's)",
     )
-    add("--grid", help="uniform, dense-jump or dense-jump:TIME (default: the policy's)")
-    add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
-    add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")
-    add("--play-on", action="store_true", help="up to the time limit, also after success")
-    add("--video", type=Path, help="MP4 of the first episode; needs EGL or OSMesa, and PyAV")
+    add("--grid", help="times of the steps: uniform, dense-jump or dense-jump:TIME (default: the policy's)")
+    add(
+        "--first-seed",
+        type=int,
+        default=EVALUATION_SEED,
+        help="simulator seed of the first episode (default: %(default)s)",
+    )
+    add("--policy-seed", type=int, default=0, help="seed of the source samples (default: %(default)s)")
+    add("--play-on", action="store_true", help="play on after success, up to the time limit")
+    add("--video", type=Path, help="MP4 file to write of the first episode; needs EGL or OSMesa, and PyAV")
 
-    # Its options are those of the recipe, --help included.
+    # tyro parses the options of train, --help included.
     added = commands.add_parser("train", help=train.__doc__, add_help=False, prefix_chars="\0")
     added.set_defaults(run=train)
     added.add_argument("options", nargs=argparse.REMAINDER)
 
     add = command(convert)
-    add("file", type=Path, help="robomimic HDF5 file, such as one of scripted demonstrations")
-    add("folder", type=Path, help="to write; must not exist")
+    add("file", type=Path, help="robomimic HDF5 file")
+    add("folder", type=Path, help="folder to write, which must not exist")
     kept = {"action": "store_const", "dest": "images"}
-    add("--images", **kept, const="image", help="with those of the file, as lossless pictures")
-    add("--video", **kept, const="video", help="with those of the file, as videos: lossy, smaller")
-    add("--observation-keys", nargs="+", help="which observations to write (default: the task's)")
-    add("--demonstrations", type=int, help="how many, from the first on (default: all)")
+    add("--images", **kept, const="image", help="include the file's images as lossless pictures")
+    add(
+        "--video",
+        **kept,
+        const="video",
+        help="include the file's images as lossy, smaller videos",
+    )
+    add("--observation-keys", nargs="+", help="observations to write (default: the task's)")
+    add("--demonstrations", type=int, help="number of demonstrations, from the first on (default: all)")
 
     add = command(observe)
-    add("file", type=Path, help="such as demo.hdf5 of robosuite's collect_human_demonstrations")
-    add("out", type=Path, help="file to write; must not exist")
-    add("--demonstrations", type=int, help="how many, from the first on (default: all)")
+    add("file", type=Path, help="recording, such as demo.hdf5 of robosuite's collect_human_demonstrations")
+    add("out", type=Path, help="robomimic HDF5 file to write, which must not exist")
+    add("--demonstrations", type=int, help="number of demonstrations, from the first on (default: all)")
     return parser
 
 
