@@ -42,8 +42,8 @@ class Sources:
     """The methods to compare."""
 
     # methods to compare, with options as in preview,correlation=0.5; gains are over the first one: gaussian,
-    # past, preview, forecast, history, regression, mip, warm-start, ot, bridge, reflow, step, cvae, a2a,
-    # leap, or package.module:Class of your own on the PYTHONPATH
+    # past, preview, forecast, history, regression, mip, mip-past, warm-start, ot, bridge, reflow, step, cvae,
+    # a2a, leap, or package.module:Class of your own on the PYTHONPATH
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
     chunk: tuple[int, ...] = (8,)  # chunk lengths H
     sigma: tuple[float, ...] = ()  # noise of warm sources, a policy per value (default: past 0.5, preview 1)
