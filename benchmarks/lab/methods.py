@@ -121,7 +121,7 @@ class Composition:
     color: str
     prior: type[Prior] = GaussianPrior
     start: type | None = None  # start point of samplers; the source sample by default
-    coupling: Callable[..., Coupling] | None = None  # coupling of source and targets; independent by default
+    coupling: Callable[..., Coupling] | None = None  # how source and targets are paired; in order by default
     teacher: str | None = None  # method whose policy the coupling needs
     sees_history: bool = False  # true if the network sees the last actions
     played: Mapping[str, Any] = field(default_factory=dict)  # fixed options of `Sampling`, if it is no flow
@@ -338,7 +338,7 @@ class Method:
         return None if self.parts.start is None else self._make(self.parts.start, widths)
 
     def coupling(self, teacher: WarmPriorActor | None = None) -> Coupling | None:
-        """Make the coupling of source and targets; None if they are independent."""
+        """Make the coupling of source and targets; None if they pair in order."""
         make = self.parts.coupling
         return None if make is None else make(*([teacher] if teacher else []), **self._own(make))
 
