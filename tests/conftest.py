@@ -1,7 +1,3 @@
-"""Settings of the whole suite."""
-
-from __future__ import annotations
-
 import gc
 import os
 import subprocess
@@ -19,6 +15,7 @@ import torch
 torch.set_num_threads(1)
 
 from tests.processes import here  # noqa: E402
+from warmprior.envs.tasks import TaskSpec  # noqa: E402
 from warmprior.io.workers import start_method  # noqa: E402
 
 # Timings on a shared machine say nothing: no test fails for being slow once.
@@ -46,6 +43,14 @@ def renders_apart():
     before = start_method()
     yield
     assert start_method() == before, "let what renders run in tests.processes.apart"
+
+
+@pytest.fixture(scope="module")
+def short_episodes():
+    """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -78,15 +83,9 @@ def ray_address():
     """A Ray cluster of two cores. Whoever connects to it cannot fork afterwards, and has to do it apart."""
     pytest.importorskip("ray")
     root = str(Path(__file__).parents[1])
-    process = subprocess.Popen(
-        [sys.executable, "-c", CLUSTER],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": root, "RAY_AUTH_MODE": "disabled"},
-    )
-    with process:
+    env = {**os.environ, "PYTHONPATH": root, "RAY_AUTH_MODE": "disabled"}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", CLUSTER], cwd=root, env=env, **pipes) as process:
         said = (line.split() for line in process.stdout)
         yield next(words[1] for words in said if words[:1] == ["address"])
         process.stdin.write("\n")

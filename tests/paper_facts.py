@@ -3,8 +3,6 @@
 Whatever repeats a number of the paper is compared with this table (tests/benchmarks/test_paper_facts.py).
 """
 
-from __future__ import annotations
-
 # Sec. 3 ("We use sigma = ...") and Table 3; the Gaussian source is N(0, I).
 SIGMA = {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
 

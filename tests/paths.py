@@ -1,7 +1,5 @@
 """Paths of a user's own, beside the library's straight one."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,3 @@
-"""What tests ask of processes."""
-
-from __future__ import annotations
-
 import functools
 import gc
 import multiprocessing

@@ -1,7 +1,3 @@
-"""Lets processes do a job together, as ``torchrun`` would start them."""
-
-from __future__ import annotations
-
 import os
 import socket
 

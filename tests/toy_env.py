@@ -1,7 +1,6 @@
 """A deterministic environment whose returns, lengths and observations are known in closed form; histories."""
 
-from __future__ import annotations
-
+from contextlib import contextmanager
 from functools import partial
 
 import torch
@@ -11,7 +10,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from warmprior import ActionWindow, Prior, StartPoint
+from warmprior import ActionWindow, Prior, StartPoint, VelocityMLP, WarmPriorActor
 from warmprior.history import advance, cold_history, without
 
 ACTION_DIM = 2
@@ -104,6 +103,32 @@ def random_history(prior, *batch, action_dim: int = ACTION_DIM, seed: int = 0, c
     executed = torch.full((*batch, 1), prior.chunk_length)
     history = advance(cold_history(batch, *shape), chunk, executed)
     return without(history, torch.rand(batch, generator=generator) < cold)
+
+
+def mlp_actor(
+    prior, action_dim=ACTION_DIM, observation_dim=2 + ACTION_DIM, steps=2, hidden_dim=8, seed=0, **options
+):
+    """A policy with a small network."""
+    torch.manual_seed(seed)
+    network = VelocityMLP(action_dim, observation_dim, prior.prediction_length, steps, hidden_dim=hidden_dim)
+    return WarmPriorActor(network, prior, **options)
+
+
+def stirred(module, by=0.1):
+    """The same with other parameters: the last layer of networks begins at zero."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.add_(by * torch.randn_like(parameter))
+    return module
+
+
+@contextmanager
+def closing(env):
+    """An environment that is closed behind its use, by whomever."""
+    try:
+        yield env
+    finally:
+        env.close(raise_if_closed=False)
 
 
 PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
