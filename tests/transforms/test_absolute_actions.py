@@ -1,9 +1,5 @@
 """Absolute poses in environments that take deltas; scipy and a kinematic gripper are the references."""
 
-from __future__ import annotations
-
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
@@ -11,10 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import ExcludeTransform, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import ExcludeTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import CountingEnv
+from tests.errors import raises
+from tests.toy_env import PLACES, CountingEnv, placed
 from warmprior import GaussianPrior
 from warmprior.modules.normalize import Normalizer
 from warmprior.transforms import AbsoluteActions, policy_transforms
@@ -22,7 +19,7 @@ from warmprior.transforms import AbsoluteActions, policy_transforms
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
 SCALE = [0.05, 0.05, 0.05, 0.5, 0.5, 0.5]
-H, HORIZON = 4, 10
+H = 4
 
 
 def absolute(pose, delta, scale=SCALE, base=None):
@@ -90,8 +87,8 @@ def test_far_targets_are_approached_at_full_speed(position, here, target, now):
 class Gripper(CountingEnv):
     """Moves exactly as its action says, from a start that its seed decides."""
 
-    def __init__(self, horizon=HORIZON):
-        super().__init__(horizon)
+    def __init__(self, length=10):
+        super().__init__(length)
         self.start = 0
         self.observation_spec = Composite(observation=Unbounded((4,)), eef_pose=Unbounded((1, 3, 4)))
         self.action_spec = Bounded(-1, 1, (7,))
@@ -120,34 +117,20 @@ class Gripper(CountingEnv):
         self.start = seed
 
 
-def transforms(*more, prior=None):
+def transforms():
     low, high = torch.full((10,), -3.0), torch.full((10,), 5.0)
     seen = torch.ones(4)
     normalizer = Normalizer({"action": low, "observation": -2 * seen}, {"action": high, "observation": seen})
-    made = policy_transforms(prior or GaussianPrior(H), normalizer=normalizer, actions=AbsoluteActions(SCALE))
-    for transform in more:
-        made.insert(0, transform)
-    return made
+    return policy_transforms(GaussianPrior(H), normalizer=normalizer, actions=AbsoluteActions(SCALE))
 
 
-def single(horizon=HORIZON):
-    return TransformedEnv(Gripper(horizon), transforms())
-
-
-PLACES = {
-    "single": single,
-    "serial, inside": lambda: SerialEnv(2, [single, partial(single, 6)]),
-    "serial, outside": lambda: TransformedEnv(SerialEnv(2, [Gripper, partial(Gripper, 6)]), transforms()),
-    "parallel, inside": lambda: ParallelEnv(2, single, mp_start_method="fork"),
-    "parallel, outside": lambda: TransformedEnv(
-        ParallelEnv(2, Gripper, mp_start_method="fork"), transforms()
-    ),
-}
+def grippers(place):
+    return placed(place, transforms, (10, 6), Gripper)
 
 
 @pytest.fixture(params=PLACES)
 def env(request):
-    env = PLACES[request.param]()
+    env = grippers(request.param)
     yield env
     env.close(raise_if_closed=False)
 
@@ -195,7 +178,7 @@ def test_grippers_go_where_they_are_told(env):
 
 
 def test_rows_that_rest_stay_where_they_are():
-    env = PLACES["serial, outside"]()
+    env = grippers("serial-outside")
     td = env.reset()
     chunk, end = targets(td["eef_pose"][1, 0].double().numpy(), np.random.default_rng(0))
     td["vla_action", "chunk"] = ((torch.from_numpy(chunk).float() - 1) / 4).expand(2, H, 10)
@@ -206,15 +189,15 @@ def test_rows_that_rest_stay_where_they_are():
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match=r"output_max \[6\].*got \[3\]"):
+    with raises(ValueError, "output_max", [6], [3]):
         AbsoluteActions([0.05] * 3)
     two_arms = AbsoluteActions(SCALE, torch.eye(3).expand(2, 3, 3))
-    with pytest.raises(ValueError, match=r"2 arm\(s\).*width 14.*have 7"):
+    with raises(ValueError, 2, 14, 7):
         TransformedEnv(Gripper(), two_arms).full_action_spec  # noqa: B018
-    with pytest.raises(KeyError, match="eef_pose=True"):
+    with raises(KeyError, "eef_pose=True"):
         blind = TransformedEnv(Gripper(), ExcludeTransform("eef_pose"))
         TransformedEnv(blind, AbsoluteActions(SCALE)).full_action_spec  # noqa: B018
     env = TransformedEnv(Gripper(), AbsoluteActions(SCALE))
     env.reset()
-    with pytest.raises(KeyError, match="what reset or step_mdp returned"):
+    with raises(KeyError, "reset"):
         env.step(TensorDict({"action": torch.zeros(10)}))

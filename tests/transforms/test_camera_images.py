@@ -1,7 +1,5 @@
 """Images in environments, against states rendered by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """ChunkStep against closed-form returns for random episode lengths, horizons and discounts."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
@@ -14,6 +12,7 @@ from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, Ten
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.errors import raises
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, ends_of
 from warmprior import ActionHistory, ChunkStep
 
@@ -104,33 +103,12 @@ def test_specs(prediction):
     assert env.observation_spec["executed_steps"].dtype == torch.int64
 
 
-@pytest.mark.parametrize("length", [2, 4])
-def test_wrong_chunk_length(length):
-    env = TransformedEnv(CountingEnv(5), ChunkStep(3))
-    with pytest.raises(ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found \({length}, 2"):
-        env.step(ones(length)(env.reset()))
-
-
-@pytest.mark.parametrize(
-    ("horizon", "options", "said"),
-    [
-        (3, {"execute": 4}, "need execute <= chunk_length <= prediction_length"),
-        (3, {"execute": 0}, "execute must be a whole number of at least 1, got 0"),
-        (3, {"execute": 2.5}, "execute must be a whole number of at least 1, got 2.5"),
-        (3, {"prediction_length": 2}, "need execute <= chunk_length <= prediction_length"),
-        (0, {}, "chunk_length must be a whole number of at least 1, got 0"),
-        (-1, {"execute": 1}, "chunk_length must be a whole number of at least 1, got -1"),
-    ],
-)
-def test_bad_lengths(horizon, options, said):
-    with pytest.raises(ValueError, match=said):
-        ChunkStep(horizon, **options)
-
-
-def test_the_reward_is_no_measure():
-    env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
-    with pytest.raises(ValueError, match="the reward 'reward'"):
-        env.step(ones(2)(env.reset()))
+def test_bad_lengths():
+    lengths = {"execute": (4, 0, 2.5), "prediction_length": (2,), "chunk_length": (0, -1)}
+    for name, values in lengths.items():
+        for value in values:
+            with raises(ValueError, name, value):
+                ChunkStep(**{"chunk_length": 3, name: value})
 
 
 def test_collector_fills_a_replay_buffer():
@@ -200,9 +178,16 @@ def test_the_sum_may_leave_the_bounds_of_one_reward(low, high, reward, gamma):
     assert (base.full_reward_spec["reward"].space.high == high).all()
 
 
-def test_actions_that_are_no_vector_are_refused():
-    with pytest.raises(ValueError, match=r"vectors \[\*B, d_a\], but 'action' has shape \(2"):
+def test_what_no_chunk_can_be():
+    env = TransformedEnv(CountingEnv(5), ChunkStep(3))
+    for length in (2, 4):
+        with raises(ValueError, "[*B, 3, d_a]", f"({length}, 2"):
+            env.step(ones(length)(env.reset()))
+    with raises(ValueError, "'action'", "[*B, d_a]", "(2"):
         TransformedEnv(VectorEnv(Unbounded((2, 1)), action_shape=()), ChunkStep(3)).rollout(1)
+    env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
+    with raises(ValueError, "'reward'"):
+        env.step(ones(2)(env.reset()))
 
 
 @pytest.mark.parametrize("place", ["single", "outside"])

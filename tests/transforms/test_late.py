@@ -1,7 +1,5 @@
 """Transforms that wait to a chunk's end, against the same environment stepped one action at a time."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

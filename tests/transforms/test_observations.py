@@ -1,7 +1,3 @@
-"""Images, several observations and other names: windows and environments give an actor the same."""
-
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
@@ -11,7 +7,8 @@ from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, placed
+from tests.errors import raises
+from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, closing, placed
 from warmprior import (
     ActionWindow,
     FlowMatchingLoss,
@@ -52,11 +49,7 @@ class CameraEnv(CountingEnv):
         return out.set(("sensors", "low", "joints"), state)
 
 
-NAMES = {
-    "image": {},
-    "nested": {},
-    "named": {"observation_key": ("sensors", "low", "joints")},
-}
+NAMES = {"image": {}, "nested": {}, "named": {"observation_key": ("sensors", "low", "joints")}}
 
 
 class Encoder(VelocityNetwork):
@@ -68,9 +61,7 @@ class Encoder(VelocityNetwork):
 
     def forward(self, t, a, observation):
         self.check_chunk(a)
-        entries = [observation]
-        if isinstance(observation, TensorDictBase):
-            entries = [observation["state"], observation["pixels"]]
+        entries = observation.values() if isinstance(observation, TensorDictBase) else [observation]
         code = sum(
             (entry.to(a.dtype).flatten(2).mean(-1) @ torch.tensor([1.0, 3.0]))[:, None, None]
             for entry in entries
@@ -79,9 +70,7 @@ class Encoder(VelocityNetwork):
 
 
 def build(place, layout, prior, **options):
-    options = {"observation_steps": TO, **NAMES[layout], **options}
-    transforms = partial(policy_transforms, prior, **options)
-
+    transforms = partial(policy_transforms, prior, observation_steps=TO, **NAMES[layout], **options)
     return placed(place, transforms, LENGTHS, partial(CameraEnv, layout=layout))
 
 
@@ -108,48 +97,44 @@ def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layou
     save_policy(actor, tmp_path)
     actor = load_policy(tmp_path)
     chunk_key = ("vla_action", "chunk")
-    env = build(place, layout, prior)
-    try:
+    with closing(build(place, layout, prior)) as env, torch.no_grad():
         check_env_specs(env)
-        with torch.no_grad():
-            rollout = env.rollout(6, actor, break_when_any_done=False)
-    finally:
-        env.close(raise_if_closed=False)
+        rollout = env.rollout(6, actor, break_when_any_done=False)
     rollout = rollout[None] if place == "single" else rollout
     loss = FlowMatchingLoss(actor)
     observation_key = names.get("observation_key", "observation")
     for row, length in zip(rollout, LENGTHS, strict=False):
         decisions = -(-length // H)
         row = row[:decisions]
+        ends = [min(start + H, length) for start in range(0, length, H)]
+        played, after = [range(i * H + 1, end + 1) for i, end in enumerate(ends)], row["next"]
+        assert after["executed_steps"].flatten().tolist() == [len(steps) for steps in played]
+        assert after["reward"].flatten().tolist() == [sum(steps) for steps in played]
+        assert after["done"].flatten().tolist() == [end == length for end in ends]
         data = replay(layout, row[chunk_key], length)
         window = ActionWindow(data, H, observation_steps=TO, **names)
         frames = torch.arange(decisions) * H
         windows = window(TensorDict({"frame": frames}, [decisions]))
-        wanted = [*actor.in_keys[1:]]
-        seen = row[observation_key]
-        wanted += (
-            [(observation_key, name) for name in ("state", "pixels")]
-            if isinstance(seen, TensorDictBase)
-            else [observation_key]
-        )
-        for key in wanted:
-            assert windows[key].dtype == row[key].dtype
-            assert torch.equal(windows[key], row[key]), key
+        read = row.select(observation_key, *actor.in_keys[1:])
+        for key, value in read.items(True, True):
+            assert windows[key].dtype == value.dtype
+            assert torch.equal(windows[key], value), key
         counted = ~windows["action_is_pad"]
         assert torch.equal(windows[chunk_key][counted], row[chunk_key][counted])
-        loss.generator = torch.Generator().manual_seed(1)
-        first = loss(windows)["loss_flow_matching"]
-        first.backward()
-        loss.generator.manual_seed(1)
         row["action_is_pad"] = windows["action_is_pad"]
-        assert torch.equal(loss(row)["loss_flow_matching"], first)
+        losses = []
+        for batch in (windows, row):
+            loss.generator = torch.Generator().manual_seed(1)
+            losses.append(loss(batch)["loss_flow_matching"])
+        losses[0].backward()
+        assert torch.equal(*losses)
 
 
 @pytest.mark.parametrize("place", ["single", "serial-inside", "parallel-outside"])
 def test_the_last_actions_are_appended_to_the_vector_among_several(place):
-    env = build(place, "nested", GaussianPrior(H), see_history=True)
-    check_env_specs(env, break_when_any_done="both")
-    rollout = env.rollout(3, break_when_any_done=False)
+    with closing(build(place, "nested", GaussianPrior(H), see_history=True)) as env:
+        check_env_specs(env, break_when_any_done="both")
+        rollout = env.rollout(3, break_when_any_done=False)
     seen, own = rollout["prior", "observation"], rollout["observation"]
     assert torch.equal(seen["pixels"], own["pixels"])
     known = (rollout["history", "steps"] >= H).float()
@@ -157,7 +142,6 @@ def test_the_last_actions_are_appended_to_the_vector_among_several(place):
     added = torch.cat([known * actions, known], -1).unsqueeze(-2)
     expected = torch.cat([own["state"], added.expand(*own["state"].shape[:-1], -1)], -1)
     assert torch.equal(seen["state"], expected) and bool(added.any())
-    env.close()
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.complex64)])
@@ -165,5 +149,5 @@ def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
     actions = torch.zeros(shape, dtype=dtype)
     data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
-    with pytest.raises(ValueError, match=r"vectors of real numbers, 'action' \[N, d_a\], got \(9"):
+    with raises(ValueError, "'action'", "[N, d_a]", "(9"):
         ActionWindow(data, H)

@@ -1,24 +1,19 @@
 """float64 demonstrations and environments, and networks of another precision than either."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations, mlp_actor
 from warmprior import (
     FlowMatchingLoss,
     Normalizer,
     PastPrior,
     PreviewPrior,
-    VelocityMLP,
-    WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
 )
@@ -27,8 +22,6 @@ H = 3
 
 
 class DoubleEnv(CountingEnv):
-    """The toy in float64, actions too, as most simulators are."""
-
     def __init__(self, length=7):
         super().__init__(length)
         self.observation_spec = Composite(observation=Unbounded((4,), dtype=torch.float64))
@@ -38,34 +31,31 @@ class DoubleEnv(CountingEnv):
         return super()._observation(action).double()
 
 
-def demonstrations(dtype):
-    generator = torch.Generator().manual_seed(0)
-    both = torch.rand(60, 4 + ACTION_DIM, generator=generator, dtype=torch.float64) * 2 - 1
-    observation, action = both.to(dtype).split((4, ACTION_DIM), dim=-1)
-    data = {"observation": observation, "action": action, "episode": torch.arange(60) // 20}
-    return TensorDict(data, [60])
+def steps(dtype):
+    data = demonstrations(d_o=4)
+    return data.update(data.select("observation", "action").to(dtype))
 
 
 def actor_of(prior, dtype):
-    torch.manual_seed(0)
-    network = VelocityMLP(ACTION_DIM, 4, prior.prediction_length, 2, hidden_dim=16)
-    return WarmPriorActor(network, prior, nfe=3, clip=1.0).to(dtype)
+    return mlp_actor(prior, hidden_dim=16, nfe=3, clip=1.0).to(dtype)
+
+
+def loss_of(prior, dtype):
+    return FlowMatchingLoss(actor_of(prior, dtype), generator=torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize("network", [torch.float32, torch.bfloat16, torch.float64])
 @pytest.mark.parametrize("data", [torch.float32, torch.float64])
 def test_training_gives_the_loss_of_full_precision(data, network):
     prior = PastPrior(H)
-    windows = window_replay_buffer(demonstrations(data), prior, batch_size=32).sample()
+    windows = window_replay_buffer(steps(data), prior, batch_size=32).sample()
     assert windows["vla_action", "chunk"].dtype == data
-    actor = actor_of(prior, network)
-    loss = FlowMatchingLoss(actor, generator=torch.Generator().manual_seed(1))
+    loss = loss_of(prior, network)
     found = loss(windows)["loss_flow_matching"]
     found.backward()
     assert found.dtype == data  # and not the network's: errors are summed over the batch
     assert all(p.grad.dtype == network and p.grad.isfinite().all() for p in loss.parameters())
-    reference = FlowMatchingLoss(actor_of(prior, torch.float64), generator=torch.Generator().manual_seed(1))
-    exact = reference(windows)["loss_flow_matching"]
+    exact = loss_of(prior, torch.float64)(windows)["loss_flow_matching"]
     tolerance = 2e-2 if network == torch.bfloat16 else 1e-5
     torch.testing.assert_close(found.double(), exact.double(), rtol=tolerance, atol=0)
 
@@ -75,7 +65,7 @@ def test_training_gives_the_loss_of_full_precision(data, network):
 @pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
 def test_environments_keep_their_precision(prior_class, env_class, network):
     prior = prior_class(H)
-    normalizer = Normalizer.fit(demonstrations(torch.float64))
+    normalizer = Normalizer.fit(steps(torch.float64))
     base = SerialEnv(2, [partial(env_class, n) for n in (7, 4)])
     env = TransformedEnv(base, policy_transforms(prior, normalizer=normalizer))
     check_env_specs(env)
@@ -90,6 +80,6 @@ def test_environments_keep_their_precision(prior_class, env_class, network):
 def test_batches_come_to_the_network():
     """As memory-mapped data to a GPU; "meta" stands for a device that other tensors cannot meet."""
     prior = PastPrior(H)
-    windows = window_replay_buffer(demonstrations(torch.float32), prior, batch_size=8).sample()
+    windows = window_replay_buffer(steps(torch.float32), prior, batch_size=8).sample()
     loss = FlowMatchingLoss(actor_of(prior, torch.float32).to("meta"))
     assert loss(windows)["loss_flow_matching"].device.type == "meta"

@@ -1,7 +1,5 @@
 """Simulators that restart rows inside a step: every decision ends where its episode does."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -22,8 +20,10 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from tests.errors import raises
 from tests.toy_env import ends_of
 from warmprior import PastPrior, keys, policy_transforms
+from warmprior.history import ENTRIES
 
 H, LENGTHS = 4, (6, 4, 3)
 PRIOR = PastPrior(H)
@@ -48,7 +48,7 @@ class Rows(EnvBase):
         self.t = torch.zeros(n, 1)
 
     def _set_seed(self, seed):
-        return seed
+        """Nothing is random."""
 
     def _seen(self):
         return torch.cat([self.t, self.lengths], -1)
@@ -90,19 +90,16 @@ def played(env, decisions=7):
 
 def reference(lengths, execute, decisions=7):
     """The decisions of each row by themselves: TorchRL's own way, one environment after the other."""
-    parts = [
-        played(TransformedEnv(Rows((length,)), policy_transforms(PRIOR, execute=execute)), decisions)
-        for length in lengths
-    ]
-    return torch.cat(parts)
+    alone = [TransformedEnv(Rows((n,)), policy_transforms(PRIOR, execute=execute)) for n in lengths]
+    return torch.cat([played(env, decisions) for env in alone])
 
 
 def check_equal(found, expected, seen_at_ends=False):
-    compared = [keys.EXECUTED, "reward", "done", *(("history", n) for n in ("actions", "steps", "forecast"))]
-    for key in compared:
-        torch.testing.assert_close(found["next", key], expected["next", key], msg=str(key))
-    for key in ["observation", "executed_steps", ("history", "actions"), ("history", "forecast_steps")]:
+    kept = [keys.EXECUTED, *((keys.HISTORY, name) for name in ENTRIES)]
+    for key in [*kept, "observation", *(("next", key) for key in ("reward", "done"))]:
         torch.testing.assert_close(found[key], expected[key], msg=str(key))
+    for key in kept:
+        torch.testing.assert_close(found["next"][key], expected["next"][key], msg=str(key))
     known = ~expected["next", "done"].squeeze(-1) | seen_at_ends
     torch.testing.assert_close(found["next", "observation"][known], expected["next", "observation"][known])
 
@@ -131,7 +128,7 @@ def test_native_autoresets_without_resets_of_rows_take_single_steps():
     env = TransformedEnv(native(resets=False), policy_transforms(PRIOR, execute=1))
     check_equal(played(env), reference(LENGTHS, 1))
     env = TransformedEnv(native(resets=False), policy_transforms(PRIOR, execute=2))
-    with pytest.raises(RuntimeError, match=r"Rows.*execute=1"):
+    with raises(RuntimeError, "Rows", "execute=1"):
         played(env)
 
 
@@ -161,7 +158,7 @@ def test_autoresets_of_torchrl_take_single_steps(append):
         return base
 
     check_equal(played(env(1)), reference(LENGTHS, 1))
-    with pytest.raises(RuntimeError, match="execute=1"):
+    with raises(RuntimeError, "execute=1"):
         played(env(3))
     check_equal(played(env(3, (6,))), reference((6,), 3))  # one row alone stops at its end
 
@@ -179,7 +176,7 @@ def test_batches_inside_of_workers_take_single_steps():
         return AutoResetEnv(Auto(restarts=True), AutoResetTransform())
 
     env = TransformedEnv(SerialEnv(2, make), policy_transforms(PRIOR, execute=2))
-    with pytest.raises(RuntimeError, match="execute=1"):
+    with raises(RuntimeError, "execute=1"):
         env.reset()
 
 
@@ -221,7 +218,7 @@ def test_vector_environments_without_autoreset(execute, nested):
 def test_vector_environments_that_restart_in_the_same_step(nested):
     found = played(vector(AutoresetMode.SAME_STEP, 1, nested))
     check_equal(found, reference(LENGTHS, 1), seen_at_ends=True)
-    with pytest.raises(RuntimeError, match=r"execute=1.*AutoresetMode\.DISABLED"):
+    with raises(RuntimeError, "execute=1", "AutoresetMode.DISABLED"):
         played(vector(AutoresetMode.SAME_STEP, 2, nested))
     check_equal(played(vector(AutoresetMode.SAME_STEP, 3, nested, (6,))), reference((6,), 3))
 
@@ -230,7 +227,7 @@ def test_vector_environments_that_restart_in_the_same_step(nested):
 def test_vector_environments_that_restart_a_step_late_are_refused(execute):
     # TorchRL's GymWrapper refuses the mode, and its GymEnv takes it.
     env = TransformedEnv(GymEnv("Pendulum-v1", num_envs=2), policy_transforms(PRIOR, execute=execute))
-    with pytest.raises(RuntimeError, match=r"NEXT_STEP.*AutoresetMode\.DISABLED"):
+    with raises(RuntimeError, "NEXT_STEP", "AutoresetMode.DISABLED"):
         env.rollout(2)
     env.close()
 

@@ -1,7 +1,5 @@
 """ObservationStack against the list of observations, with partial steps and resets."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
@@ -9,6 +7,7 @@ import torch
 from torchrl.envs import CatFrames, Compose, SerialEnv, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import check_env_specs
 
+from tests.errors import raises
 from tests.toy_env import CountingEnv
 from warmprior import ObservationStack
 
@@ -50,10 +49,10 @@ def test_rows_that_reset_or_rest_alone():
 
 
 def test_errors():
-    with pytest.raises(ValueError, match=r"steps must be .* at least 1, got 0"):
+    with raises(ValueError, "steps", 0):
         ObservationStack(0)
     env = TransformedEnv(CountingEnv(9), ObservationStack(2))
     data = env.rand_action(env.reset())
     del data["observation"]
-    with pytest.raises(KeyError, match="reset or step_mdp"):
+    with raises(KeyError, "reset"):
         env.step(data)

@@ -1,19 +1,17 @@
 """Training windows against loops in plain Python and against TorchRL's own sequence sampler."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.errors import raises
 from warmprior import ActionWindow, PastPrior, PreviewPrior, WithheldHistory, window_replay_buffer
 from warmprior.checks import check_finite_steps
 
 
 def steps(lengths, numbers=None):
-    """Data in which every entry tells its own episode and step."""
     numbers = range(len(lengths)) if numbers is None else numbers
     rows = [(e, i) for e, n in zip(numbers, lengths, strict=True) for i in range(n)]
     code = torch.tensor([100.0 * e + i + 1 for e, i in rows])
@@ -120,38 +118,16 @@ def test_withholding_takes_whole_histories():
     assert torch.equal(batch["observation"][cold], twin["observation"])
 
 
-def test_a_share_that_is_none_and_a_history_that_is_missing():
-    for wrong in (-0.1, 1.1, float("nan"), True, "abc"):
-        with pytest.raises(ValueError, match="probability"):
-            WithheldHistory(wrong)
-    with pytest.raises(KeyError, match="append it after ActionWindow"):
-        WithheldHistory(0.5)(TensorDict({}, [3]))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"observation_steps": 0}, "observation_steps must be a whole number of at least 1, got 0"),
-        ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*got 0"),
-        ({"prediction_length": 1}, "got 2, 1 and 2"),
-        ({"history_length": 1}, "got 2, 2 and 1"),
-    ],
-)
-def test_lengths_that_cannot_be(options, message):
-    with pytest.raises(ValueError, match=message):
-        ActionWindow(steps([3]), **({"chunk_length": 2} | options))
-
-
 def test_data_that_cannot_be():
     data, folded = steps([3, 4]), steps([3, 3]).reshape(2, 3)
     pieces = data.clone().set("episode", torch.tensor([0, 0, 1, 1, 0, 2, 2]))
-    for wrong, error, said in (
-        (data.exclude("action"), KeyError, "the data lack 'action'"),
-        (pieces, ValueError, "steps of episode 0 are not contiguous"),
-        (data[:0], ValueError, r"flat steps \[N\] with N > 0"),
-        (folded, ValueError, "flat steps"),
+    for wrong, error, fact in (
+        (data.exclude("action"), KeyError, "'action'"),
+        (pieces, ValueError, "episode 0"),
+        (data[:0], ValueError, "[N]"),
+        (folded, ValueError, "[N]"),
     ):
-        with pytest.raises(error, match=said):
+        with raises(error, fact):
             ActionWindow(wrong, 2)
 
 
@@ -161,10 +137,19 @@ def test_bad_values_are_located_in_every_part_of_the_data(bad):
     check_finite_steps("observation", value, memory=90)
     value[bad, 2] = float("nan")
     value[1999, 1] = float("inf")
-    with pytest.raises(ValueError, match=f"'observation' holds NaN or Inf, first at step {bad}$"):
+    with raises(ValueError, "'observation'", f"step {bad}"):
         check_finite_steps("observation", value, memory=90)
 
 
-def test_a_buffer_that_cannot_be():
-    with pytest.raises(ValueError, match="batch_size must be a whole number of at least 1"):
+def test_options_that_cannot_be():
+    for wrong in (-0.1, 1.1, float("nan"), True, "abc"):
+        with raises(ValueError, "probability"):
+            WithheldHistory(wrong)
+    with raises(KeyError, "ActionWindow"):
+        WithheldHistory(0.5)(TensorDict({}, [3]))
+    for name in ("observation_steps", "chunk_length", "prediction_length", "history_length"):
+        value = int(name in ("prediction_length", "history_length"))  # less than the chunk
+        with raises(ValueError, name, value):
+            ActionWindow(steps([3]), **{"chunk_length": 2, name: value})
+    with raises(ValueError, "batch_size", 0):
         window_replay_buffer(steps([20]), PastPrior(2), batch_size=0)
