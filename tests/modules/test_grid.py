@@ -1,12 +1,9 @@
-"""Integration grids: by hand, and against fields whose solution every grid finds."""
-
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest
 import torch
 
+from tests.errors import raises
 from tests.modules.test_ode import STAGES, Counting, batch
 from warmprior import ODEActor, integrate
 
@@ -31,14 +28,8 @@ def test_dense_jump_by_hand():
 def test_times_of_every_solver(solver, start_time):
     nodes = {"euler": (0.0,), "midpoint": (0, 0.5), "heun": (0, 1), "rk4": (0, 0.5, 0.5, 1)}[solver]
     network = Counting()
-    actor = ODEActor(
-        network,
-        nfe=4 * STAGES[solver],
-        solver=solver,
-        grid="dense-jump",
-        start_time=start_time,
-    )
-    actor(batch(5))
+    options = {"solver": solver, "grid": "dense-jump", "start_time": start_time}
+    ODEActor(network, nfe=4 * STAGES[solver], **options)(batch(5))
     half = start_time + 0.5 * (1 - start_time)
     points = [start_time + (half - start_time) * k / 3 for k in range(4)] + [1.0]
     expected = [b + node * (e - b) for b, e in pairwise(points) for node in nodes]
@@ -65,16 +56,9 @@ def test_linear_fields_are_solved_on_every_grid(grid, start_time):
         torch.testing.assert_close(found, a0 + (1 - start_time**2) * a1)
 
 
-@pytest.mark.parametrize(
-    ("grid", "message"),
-    [
-        ("dense", "unknown grid 'dense'; choose one of uniform, dense-jump"),
-        ("dense-jump:0", r"must start in \(0, 1\), got 'dense-jump:0'"),
-        ("dense-jump:half", r"must start in \(0, 1\)"),
-    ],
-)
-def test_bad_grids(grid, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("grid", ["dense", "dense-jump:0", "dense-jump:half"])
+def test_bad_grids(grid):
+    with raises(ValueError, f"'{grid}'"):
         ODEActor(Counting(), grid=grid)
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, f"'{grid}'"):
         integrate(lambda t, a: a, torch.ones(1, 1), nfe=1, grid=grid)

@@ -1,20 +1,10 @@
-"""Interpolants: ends, velocity by automatic differentiation, broadcasting."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 
 from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
 from warmprior import LinearInterpolant
 
-ALL = [
-    LinearInterpolant(),
-    TrigonometricInterpolant(),
-    PolynomialInterpolant(1.0),
-    PolynomialInterpolant(2.0),
-    PolynomialInterpolant(3.5),
-]
+ALL = [LinearInterpolant(), TrigonometricInterpolant(), *map(PolynomialInterpolant, (1.0, 2.0, 3.5))]
 BY_NAME = pytest.mark.parametrize("interpolant", ALL, ids=lambda i: str(i.config()))
 
 

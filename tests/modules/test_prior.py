@@ -1,10 +1,7 @@
-"""What every source shares: lengths, Eq. 1, correlated noise, arguments and registry."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 
+from tests.errors import raises
 from tests.paper_facts import SIGMA
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
@@ -16,8 +13,8 @@ PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 @pytest.mark.parametrize("horizon", [1, 2, 8])
 def test_lengths_and_default_sigma(prior_class, horizon):
     prior = prior_class(horizon)
-    assert prior.prediction_length == (2 * horizon if prior_class is PreviewPrior else horizon)
-    assert prior.history_length == horizon
+    length = 2 * horizon if prior_class is PreviewPrior else horizon
+    assert (prior.prediction_length, prior.history_length) == (length, horizon)
     assert (prior.sigma, prior.correlation) == (SIGMA[prior.name], 0.0)
 
 
@@ -67,17 +64,16 @@ def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlatio
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "message"),
+    ("name", "value"),
     [
-        ((0,), {}, "chunk_length"),
-        ((4,), {"sigma": -0.1}, "sigma"),
-        ((4,), {"sigma": float("nan")}, "sigma"),
-        ((4,), {"correlation": 1.1}, "correlation"),
-        ((4,), {"correlation": "abc"}, "correlation must be a finite number, got 'abc'"),
+        ("chunk_length", 0),
+        *(("sigma", v) for v in (-0.1, float("nan"))),
+        ("correlation", 1.1),
+        ("correlation", "abc"),
     ],
 )
 @pytest.mark.parametrize("prior_class", PRIORS)
-def test_bad_arguments(prior_class, arguments, options, message):
-    wrong = TypeError if prior_class is GaussianPrior and options else ValueError
-    with pytest.raises(wrong, match=next(iter(options)) if wrong is TypeError else message):
-        prior_class(*arguments, **options)
+def test_bad_arguments(prior_class, name, value):
+    unknown = prior_class is GaussianPrior and name != "chunk_length"
+    with raises(TypeError if unknown else ValueError, name, *([] if unknown else [value])):
+        prior_class(**{"chunk_length": 4, name: value})

@@ -1,7 +1,3 @@
-"""PriorSampler: keys, generator and errors."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,7 +1,5 @@
 """What follows from where the grippers are, against scipy and numpy's least squares."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
