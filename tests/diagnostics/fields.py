@@ -1,11 +1,8 @@
-"""Policies with known velocity fields, and batches for them."""
-
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.toy_env import stirred
 from warmprior import GaussianPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.history import cold_history
 
@@ -13,8 +10,6 @@ H, D_A = 3, 2
 
 
 class Field(nn.Module):
-    """A velocity network from a function of time, point and observation."""
-
     def __init__(self, function):
         super().__init__()
         self.function = function
@@ -31,10 +26,8 @@ def policy(function, prior=None, seed=0, **options):
 
 def batch(n=5, length=H, d_a=D_A, **extra):
     torch.manual_seed(1)
-    data = TensorDict(
-        {"observation": torch.randn(n, 1, 4), "history": cold_history([n], min(H, length), length, d_a)}, [n]
-    )
-    return data.update(extra)
+    data = {"observation": torch.randn(n, 1, 4), "history": cold_history([n], min(H, length), length, d_a)}
+    return TensorDict({**data, **extra}, [n])
 
 
 def targets(prior, n, spread=1.0, loc=0.0, d_a=D_A):
@@ -50,27 +43,15 @@ def remember(data, loc, warm=True):
     """Write a history that both WP-Past and WP-Preview make the mean ``loc`` of, where it is warm."""
     history = data["history"]
     length = history["actions"].shape[-2]
-    steps = torch.full((len(data), 1), length) * warm
-    forecast = torch.zeros_like(history["forecast"])
-    forecast[:, :length] = loc[:, :length]
-    return data.update(
-        {
-            "history": {
-                "actions": loc[:, :length].clone(),
-                "steps": steps,
-                "forecast": forecast,
-                "forecast_steps": steps.clone(),
-            }
-        }
-    )
+    for steps in ("steps", "forecast_steps"):
+        history[steps] = torch.full((len(data), 1), length) * warm
+    for actions in ("actions", "forecast"):
+        history[actions][:, :length] = loc[:, :length]
+    return data
 
 
 def seeing_network(d_a, state_dim, length):
     """A small network that sees one camera, with weights of which none is zero."""
     torch.manual_seed(0)
     encoder = ImageEncoder(["cam_image"], state_dim, image_size=16, crop_size=12, backbone="small")
-    velocity = VelocityMLP(d_a, encoder.observation_dim, length, hidden_dim=16)
-    network = VisionNetwork(encoder, velocity)
-    for parameter in network.parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
-    return network
+    return stirred(VisionNetwork(encoder, VelocityMLP(d_a, encoder.observation_dim, length, hidden_dim=16)))

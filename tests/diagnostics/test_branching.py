@@ -1,7 +1,5 @@
 """Branching cost against closed forms, and its bound on random mixtures."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

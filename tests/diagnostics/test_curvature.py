@@ -1,13 +1,12 @@
 """Curvature against fields whose paths are known in closed form."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
+from tests.errors import raises
 from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import curvature
 
@@ -22,14 +21,11 @@ def test_a_linear_field_has_the_closed_form(n_steps):
     out = curvature(policy(lambda t, a, o: -a, prior), data, n_steps)
     length = mean.double().square().sum((-1, -2))
     factors = (1 - 1 / n_steps) ** torch.arange(n_steps, dtype=torch.float64)
-    torch.testing.assert_close(
-        out["kappa"].double(), length * factors.var(correction=0), rtol=1e-4, atol=1e-7
-    )
-    torch.testing.assert_close(out["speed"].double(), length * factors.mean() ** 2, rtol=1e-4, atol=1e-7)
     gap = (1 - 1 / n_steps) ** n_steps  # one step ends at 0, the path at this share of a0
-    torch.testing.assert_close(
-        out["one_step_error"].double(), (length / (H * D_A)).sqrt() * gap, rtol=1e-4, atol=1e-6
-    )
+    expected = {"kappa": length * factors.var(correction=0), "speed": length * factors.mean() ** 2}
+    expected["one_step_error"] = (length / (H * D_A)).sqrt() * gap
+    for name, value in expected.items():
+        torch.testing.assert_close(out[name].double(), value, rtol=1e-4, atol=1e-6)
 
 
 def test_executed_positions_and_padding_count_separately():
@@ -61,7 +57,7 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
         optimal = (2 * t - 1) / ((1 - t) ** 2 + t**2) * a[:, H:]
         return torch.cat([0.01 * torch.sin(9 * t) + 0 * a[:, :H], optimal], 1)
 
-    with pytest.warns(UserWarning, match="on the executed positions"):
+    with pytest.warns(UserWarning, match="executed"):
         out = curvature(policy(lazy, prior), data)
     assert out["kappa_executed"].isnan().all() and out["relative_executed"].isnan().all()
     assert torch.isfinite(out["kappa"]).all()
@@ -74,13 +70,13 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
 
 def test_bad_options_and_policies_are_named():
     field = policy(lambda t, a, o: -a)
-    with pytest.raises(ValueError, match=r"n_steps must be .*at least 2, got 1"):
+    with raises(ValueError, "n_steps", 2, 1):
         curvature(field, batch(), 1)
-    with pytest.raises(ValueError, match=r"at most 1 .*not 100"):
+    with raises(ValueError, 1, 100):
         curvature(policy(lambda t, a, o: -a, max_nfe=1), batch())
 
     def explodes(t, a, o):
         return torch.where((torch.arange(len(a)) == 2).view(-1, 1, 1), a * torch.inf, -a)
 
-    with pytest.raises(FloatingPointError, match=r"1 of 5 paths.*observation 2"):
+    with raises(FloatingPointError, "1 of 5", "observation 2"):
         curvature(policy(explodes), batch())

@@ -1,14 +1,12 @@
 """Observations shared by policies of different priors, against a loop over the data."""
 
-from __future__ import annotations
-
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.diagnostics.fields import policy
+from tests.errors import raises
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations
 
@@ -17,15 +15,9 @@ H = 3
 
 def steps(lengths, d_a=1):
     episode = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
-    n = len(episode)
-    return TensorDict(
-        {
-            "observation": torch.arange(float(n))[:, None].expand(n, 4).contiguous(),
-            "action": torch.arange(float(n))[:, None].expand(n, d_a).contiguous(),
-            "episode": episode,
-        },
-        [n],
-    )
+    numbers = torch.arange(float(len(episode)))[:, None]
+    data = {"observation": numbers.repeat(1, 4), "action": numbers.repeat(1, d_a), "episode": episode}
+    return TensorDict(data, episode.shape)
 
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=6), st.integers(1, 4))
@@ -75,17 +67,18 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
     # Predicted H steps earlier, the chunk's second half forecasts exactly the current one.
     expected = shared.frames[:, None] + torch.arange(H)
     torch.testing.assert_close(met["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0)
+    assert (met["history", "steps"] == H).all()
     assert torch.equal(met["vla_action", "chunk"], shared.windows(prior)["vla_action", "chunk"])
 
 
 def test_bad_input_is_named():
     data = steps([5, 4])
-    with pytest.raises(ValueError, match="count=100 observations, but 3 of 9 steps"):
+    with raises(ValueError, "count=100", "3 of 9"):
         SharedObservations(data, H, count=100)
-    with pytest.raises(ValueError, match=r"chunk length: .* has"):
+    with raises(ValueError, "chunk length"):
         SharedObservations(data, H).windows(PastPrior(H + 1))
     for offset in (-1, H + 1):
-        with pytest.raises(ValueError, match=f"offset must be between 0 and {H}"):
+        with raises(ValueError, "offset", 0, H):
             SharedObservations(data, H).windows(PastPrior(H), offset=offset)
-    with pytest.raises(KeyError, match="episode"):
+    with raises(KeyError, "episode"):
         SharedObservations(data.exclude("episode"), H)

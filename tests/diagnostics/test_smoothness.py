@@ -1,7 +1,5 @@
 """Smoothness of rollouts against plain loops over the executed actions."""
 
-from __future__ import annotations
-
 import math
 import random
 from itertools import pairwise
@@ -12,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from warmprior import GaussianPrior, HistoryObservation, PastPrior, VelocityMLP, WarmPriorActor, keys
+from tests.errors import raises
+from tests.toy_env import mlp_actor, stirred
+from warmprior import GaussianPrior, HistoryObservation, PastPrior, keys
 from warmprior.diagnostics import executed_actions, smoothness
 from warmprior.diagnostics.leaks import HistoryShift
 from warmprior.history import cold_history
@@ -65,15 +65,14 @@ def test_against_loops(rows, decisions, horizon, seed):
 
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
-    with pytest.raises(KeyError, match="ChunkStep"):
+    with raises(KeyError, "ChunkStep"):
         smoothness(TensorDict({"vla_action": {"chunk": chunks}}, [3]))
-    with pytest.raises(ValueError, match="no chunk boundary"):
-        smoothness(rollout_of(chunks[:1], [2]))
-    with pytest.raises(ValueError, match="no chunk boundary"):
-        smoothness(rollout_of(chunks[:2], [2, 2], [True, True]))
-    with pytest.raises(ValueError, match="NaN"):
+    for rollout in (rollout_of(chunks[:1], [2]), rollout_of(chunks[:2], [2, 2], [True, True])):
+        with raises(ValueError, "chunk boundary"):
+            smoothness(rollout)
+    with raises(ValueError, "NaN"):
         smoothness(rollout_of(chunks * math.nan, [2, 2, 2]))
-    with pytest.raises(ValueError, match="decisions"):
+    with raises(ValueError, "decisions"):
         executed_actions(rollout_of(chunks[:0], torch.zeros(0, dtype=torch.int64)))
 
 
@@ -82,10 +81,8 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
     prior = GaussianPrior(2) if see_history else PastPrior(2)
     width = HistoryObservation.width(2, 1) if see_history else 0
     key = keys.CONDITIONED if see_history else keys.OBSERVATION
-    network = VelocityMLP(1, 3 + width, 2, 1, hidden_dim=8)
-    for parameter in network.parameters():
-        parameter.data.normal_()  # the last layer begins at zero
-    actor = WarmPriorActor(network, prior, observation_key=key, generator=torch.Generator().manual_seed(0))
+    options = {"observation_key": key, "generator": torch.Generator().manual_seed(0)}
+    actor = stirred(mlp_actor(prior, 1, 3 + width, steps=1, **options), by=1.0)
     data = TensorDict({"observation": torch.zeros(4, 1, 3), "history": cold_history([4], 2, 2, 1)}, [4])
     data["history", "actions"][:2] = 1.0
     data["history", "steps"][:2] = 2
@@ -98,5 +95,5 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
     out = disturbed(HistoryObservation()(data))
     torch.testing.assert_close(out["vla_action", "chunk"], chunk)
     assert (out["history", "actions"][:2] == 1).all()
-    with pytest.raises(ValueError, match="std"):
+    with raises(ValueError, "std"):
         HistoryShift(actor, -1.0)

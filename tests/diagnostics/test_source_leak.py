@@ -1,7 +1,5 @@
 """Source leak against closed forms, and the data's spread against loops over the windows."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -10,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
+from tests.errors import raises
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import source_leak
 
 
 def windows(n=400, length=H, d_a=D_A, seed=2):
-    """Windows with random targets, all cold."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.randn(n, length, d_a, generator=generator)
     return batch(n, length, d_a, vla_action={"chunk": target})
@@ -114,12 +112,8 @@ def test_neighbours_come_from_other_episodes():
     """Four episodes of slow observations, each with an action of its own: +1 or -1."""
     episodes = torch.arange(4).repeat_interleave(20)
     side = (episodes % 2 * 2.0 - 1)[:, None, None]
-    data = windows(80).update(
-        {
-            "observation": torch.arange(20.0).repeat(4)[:, None, None] + 0.01 * side,
-            "vla_action": {"chunk": side.expand(80, H, D_A).clone()},
-        }
-    )
+    seen = torch.arange(20.0).repeat(4)[:, None, None] + 0.01 * side
+    data = batch(80, observation=seen, vla_action={"chunk": side.expand(80, H, D_A).clone()})
     actor = policy(passing(0.5))
     # The nearest episode agrees with the window, the other two do not.
     assert source_leak(actor, data, episodes=episodes, nfes=(1,))[1].data_spread == 0.0
@@ -131,7 +125,7 @@ def test_neighbours_come_from_other_episodes():
     # Without episodes the other windows of one's own are neighbours, too.
     alone = data[:20].clone()
     assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
-    with pytest.raises(ValueError, match="another episode"):
+    with raises(ValueError, "episode"):
         source_leak(actor, alone, episodes=episodes[:20])
 
 
@@ -150,11 +144,11 @@ def test_padded_positions_do_not_count():
 
 def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
-    with pytest.raises(KeyError, match="chunk"):
+    with raises(KeyError, "chunk"):
         source_leak(actor, data.exclude(("vla_action", "chunk")))
-    with pytest.raises(ValueError, match=r"episodes .*\[4\], expected \[5\]"):
+    with raises(ValueError, "episodes", "[4]", "[5]"):
         source_leak(actor, data, episodes=torch.zeros(4))
-    with pytest.raises(ValueError, match=r"draws must be .*at least 2, got 1"):
+    with raises(ValueError, "draws", 2, 1):
         source_leak(actor, data, draws=1)
-    with pytest.raises(FloatingPointError, match="NFE 9"):
+    with raises(FloatingPointError, "NFE 9"):
         source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)

@@ -1,7 +1,5 @@
 """Pairings of source and data, against brute force and closed forms."""
 
-from __future__ import annotations
-
 from itertools import permutations
 
 import pytest
@@ -11,16 +9,10 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
+from tests.errors import raises
 from tests.objectives.test_flow_matching import actor_for, sample
-from tests.toy_env import demonstrations
-from warmprior import (
-    FlowMatchingLoss,
-    GaussianPrior,
-    SourceMoments,
-    VelocityMLP,
-    WarmPriorActor,
-    window_replay_buffer,
-)
+from tests.toy_env import demonstrations, mlp_actor
+from warmprior import FlowMatchingLoss, GaussianPrior, SourceMoments, WarmPriorActor, window_replay_buffer
 from warmprior.objectives import OTCoupling, ReflowCoupling
 
 pytest.importorskip("scipy")
@@ -37,13 +29,10 @@ def test_the_plan_is_the_best_of_all_permutations(n, weight, seed):
     paired, target = OTCoupling(weight)(a0, a1, seen)
     assert target is a1
 
-    def cost(order):
-        o = list(order)
-        moved = (a0[o] - a1).square().sum() + weight * (seen[o] - seen).square().sum()
-        return float(moved)
+    def cost(o):
+        return float((a0[o] - a1).square().sum() + weight * (seen[o] - seen).square().sum())
 
-    best = min(permutations(range(n)), key=cost)
-    assert torch.equal(paired, a0[list(best)])
+    assert torch.equal(paired, a0[min(map(list, permutations(range(n))), key=cost)])
 
 
 def test_dear_observations_leave_everything_in_its_place():
@@ -72,14 +61,14 @@ def test_moments_are_those_of_the_pairs():
 
 def test_what_cannot_be_paired():
     couple, chunk = OTCoupling(), torch.zeros(2, H, 1)
-    with pytest.raises(ValueError, match="at least 2"):
+    with raises(ValueError, 2):
         couple(chunk[:1], chunk[:1], torch.zeros(1, 1, 3))
-    for said, seen in (("none", None), ("nested", TensorDict({"pose": torch.zeros(2, 3)}, [2]))):
-        with pytest.raises(ValueError, match=f"compares .*{said}.*observation_weight=0"):
+    for seen in (None, TensorDict({"pose": torch.zeros(2, 3)}, [2])):
+        with raises(ValueError, "observation_weight=0"):
             couple(chunk, chunk, seen)
         OTCoupling(0.0)(chunk, chunk, seen)
     for weight in (-1.0, float("inf"), float("nan"), True, "abc"):
-        with pytest.raises(ValueError, match="observation_weight"):
+        with raises(ValueError, "observation_weight"):
             OTCoupling(weight)
 
 
@@ -97,15 +86,15 @@ def test_reflow_pairs_sources_with_the_ends_of_the_teachers_flow():
     assert same is a0
     level = seen[:, :, :1]
     torch.testing.assert_close(target, level + 0.75**4 * (a0 - level))
-    with pytest.raises(ValueError, match=f"chunks of {H + 1} actions, but the teacher's have {H}"):
+    with raises(ValueError, H + 1, H):
         couple(torch.zeros(5, H + 1, 1), a1, seen)
     for nfe in (0, 2.5, True):
-        with pytest.raises(ValueError, match="nfe"):
+        with raises(ValueError, "nfe"):
             ReflowCoupling(couple.teacher, nfe=nfe)
 
 
 def test_a_teacher_is_frozen_and_follows_the_data_to_their_device():
-    actor = WarmPriorActor(VelocityMLP(1, 3, H, 1, hidden_dim=8), GaussianPrior(H))
+    actor = mlp_actor(GaussianPrior(H), 1, 3, steps=1)
     couple = ReflowCoupling(actor)
     assert not couple.teacher.training and not any(p.requires_grad for p in actor.parameters())
     for device in ("cpu", "meta"):

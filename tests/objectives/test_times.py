@@ -1,7 +1,5 @@
 """Training times against their densities, written down and integrated here."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
