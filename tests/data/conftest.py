@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -7,6 +5,14 @@ import pytest
 pytest.importorskip("h5py")
 
 from tests.data.synthetic import write_robomimic_file
+
+
+@pytest.fixture(scope="module", autouse=True)
+def offline():
+    """LeRobot asks the hub for nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+        yield
 
 
 @pytest.fixture

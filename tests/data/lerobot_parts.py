@@ -1,7 +1,3 @@
-"""Small LeRobotDatasets, written by LeRobot itself."""
-
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -67,7 +63,6 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
 
 
 def edit_json(path: Path, change):
-    """Change what a JSON file holds."""
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

@@ -1,7 +1,3 @@
-"""Small robomimic files with known contents."""
-
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

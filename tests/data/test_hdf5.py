@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -9,6 +7,7 @@ import pytest
 import torch
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.errors import raises
 from warmprior.data import RobomimicDemonstrations
 from warmprior.data.hdf5 import RobomimicReader, read_index
 from warmprior.data.replay import DatasetError
@@ -32,9 +31,9 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
     assert read_index(path, demos=11).demos == tuple(f"demo_{n}" for n in range(11))
     assert read_index(path, demos=2, filter_key="late").demos == ("demo_3", "demo_10")
-    with pytest.raises(DatasetError, match=r"file\.hdf5: .*12 demonstrations.*demos=13"):
+    with raises(DatasetError, "file.hdf5", 12, "demos=13"):
         read_index(path, demos=13)
-    with pytest.raises(ValueError, match=r"demos must be .*at least 1, got 0"):
+    with raises(ValueError, "demos", 0):
         read_index(path, demos=0)
 
 
@@ -52,9 +51,7 @@ def test_unknown_environment_uses_what_it_finds(tmp_path):
     )
 
     for nothing in [], ():
-        with pytest.raises(
-            DatasetError, match=r"file\.hdf5: no observations are chosen.*observation_keys.*robot0_eef_pos"
-        ):
+        with raises(DatasetError, "file.hdf5", "observation_keys", "robot0_eef_pos"):
             read_index(path, observation_keys=nothing)
 
 
@@ -83,7 +80,7 @@ def test_files_without_rewards(tmp_path):
     with_rewards = RobomimicDemonstrations(path).data
     with h5py.File(path, "a") as file:
         del file["data/demo_1/rewards"]
-    with pytest.raises(DatasetError, match=r"file\.hdf5: data/demo_1 .*data/demo_0.*'rewards'"):
+    with raises(DatasetError, "file.hdf5", "data/demo_1", "data/demo_0", "'rewards'"):
         read_index(path)
     with h5py.File(path, "a") as file:
         for number in (0, 2):
@@ -111,19 +108,18 @@ def test_a_shaped_reward_is_no_success_before_its_scale(tmp_path, kwargs, solved
     assert not (data["next", "terminated"] & data["next", "truncated"]).any()
 
 
-# ---------------------------------------------------------------------------- bad files
 def test_a_raw_recording_of_robosuite(tmp_path):
     path = tmp_path / "demo.hdf5"
     write_robomimic_file(path)
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
             del demo["obs"], demo["rewards"], demo["dones"]
-    with pytest.raises(DatasetError, match=r"demo\.hdf5: data/demo_0 .*'obs'.*states"):
+    with raises(DatasetError, "demo.hdf5", "data/demo_0", "'obs'", "states"):
         read_index(path)
     with h5py.File(path, "a") as file:
         del file["data"].attrs["env_args"], file["data"].attrs["total"]
         file["data"].attrs["env"] = "NutAssemblySquare"
-    with pytest.raises(DatasetError, match=r"demo\.hdf5: .*'obs'.*states.*observe"):
+    with raises(DatasetError, "demo.hdf5", "'obs'", "states", "observe"):
         read_index(path)
 
 
@@ -133,7 +129,7 @@ def test_a_file_that_another_process_writes(square_file):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as other:
         assert other.stdout.readline() == "open\n"
-        with pytest.raises(DatasetError, match=r"square\.hdf5: another process .*HDF5_USE_FILE_LOCKING"):
+        with raises(DatasetError, "square.hdf5", "HDF5_USE_FILE_LOCKING"):
             read_index(path)
         other.stdin.close()
     read_index(path)
@@ -146,7 +142,7 @@ def test_a_flipped_bit_in_a_name(square_file):
     path.write_bytes(path.read_bytes().replace(b"demo_1\0", b"demo_0\0", 1))
     with h5py.File(path) as file:
         assert list(file["data"]).count("demo_0") == 2
-    with pytest.raises(DatasetError, match=r"square\.hdf5: data .*'demo_0' twice"):
+    with raises(DatasetError, "square.hdf5", "'demo_0'"):
         read_index(path)
 
 
@@ -154,47 +150,44 @@ def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         del file["data/demo_1"]
-    with pytest.raises(DatasetError, match=r"square\.hdf5: data\.attrs\['total'\] counts 47 .* 42"):
+    with raises(DatasetError, "square.hdf5", "data.attrs['total']", 47, 42):
         read_index(path)
     assert len(read_index(path, filter_key="train").demos) == len(read_index(path, demos=2).demos) == 2
     with h5py.File(path, "a") as file:
         file["data"].attrs["total"] = "many"
-    with pytest.raises(DatasetError, match=r"square\.hdf5: data\.attrs\['total'\]"):
+    with raises(DatasetError, "square.hdf5", "data.attrs['total']"):
         read_index(path)
     with h5py.File(path, "a") as file:
         del file["data"].attrs["total"]
     assert len(read_index(path).demos) == 2
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"absent\.hdf5: no such file"):
-        read_index(tmp_path / "absent.hdf5")
-    with pytest.raises(IsADirectoryError, match=f"{tmp_path} is a folder"):
-        read_index(tmp_path)
-
-
-@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99, None])
-def test_truncated_file(square_file, keep):
+def test_what_is_no_file_or_not_whole(square_file, tmp_path):
     path, _ = square_file
-    content = path.read_bytes()
-    path.write_bytes(b"<html>please log in" if keep is None else content[: int(keep * len(content))])
-    with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*again"):
-        read_index(path)
+    for place, error in ((tmp_path / "absent.hdf5", FileNotFoundError), (tmp_path, IsADirectoryError)):
+        with raises(error, place):
+            read_index(place)
+    whole = path.read_bytes()
+    parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
+    for content in (*parts, b"<html>please log in"):
+        path.write_bytes(content)
+        with raises(DatasetError, "square.hdf5", "HDF5"):
+            read_index(path)
 
 
 def test_filter_keys(square_file, tmp_path):
     path, _ = square_file
-    with pytest.raises(DatasetError, match=r"filter key 'better'.*empty, train, valid"):
+    with raises(DatasetError, "'better'", "empty, train, valid"):
         read_index(path, filter_key="better")
-    with pytest.raises(DatasetError, match="mask/empty names no demos"):
+    with raises(DatasetError, "mask/empty"):
         read_index(path, filter_key="empty")
     with h5py.File(path, "a") as file:
         del file["data/demo_2"]
-    with pytest.raises(DatasetError, match=r"mask/train names .*demo_2"):
+    with raises(DatasetError, "mask/train", "demo_2"):
         read_index(path, filter_key="train")
     bare = tmp_path / "bare.hdf5"
     write_robomimic_file(bare)
-    with pytest.raises(DatasetError, match=r"'train'.* none"):
+    with raises(DatasetError, "'train'", "none"):
         read_index(bare, filter_key="train")
 
 
@@ -211,5 +204,5 @@ def test_corrupt_values(tmp_path):
         raw.seek(offset)
         raw.write(b"\x01\x02\x03")
     read_index(path)
-    with h5py.File(path) as file, pytest.raises(DatasetError, match=r"data/demo_0/actions cannot be read"):
+    with h5py.File(path) as file, raises(DatasetError, "data/demo_0/actions"):
         RobomimicReader(file).numbers("demo_0", "actions", np.empty((12, 7)))

@@ -1,7 +1,3 @@
-"""LeRobotDatasets as replay buffers, beside LeRobot's own reader."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -20,16 +16,8 @@ from warmprior.envs.tasks import TASKS
 H, TO = 4, 3
 
 
-@pytest.fixture(scope="module", autouse=True)
-def offline():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-        yield
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Episodes in several files, with both kinds of images; and their values."""
     root = tmp_path_factory.mktemp("data") / "lift"
     images = (("agentview", "image"), ("robot0_eye_in_hand", "video"))
     values = write_lerobot(root, images=images, data_files_size_in_mb=0.001)

@@ -1,7 +1,3 @@
-"""Damaged, incomplete and unfitting LeRobotDatasets: refused by file and key, with what to do."""
-
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -13,6 +9,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
+from tests.errors import raises
 from warmprior.data import DatasetError, LeRobotDemonstrations
 from warmprior.data.lerobot_index import read_lerobot_index
 
@@ -24,9 +21,7 @@ CAMERA = "observation.images.agentview"
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     root = tmp_path_factory.mktemp("whole") / "lift"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-        write_lerobot(root, images=(("agentview", "image"), ("side", "video")))
+    write_lerobot(root, images=(("agentview", "image"), ("side", "video")))
     return root
 
 
@@ -109,70 +104,55 @@ MALFORMED = {
     "codebase_version": info_of("codebase_version", 3),
 }
 TEMPLATES = ["{chunk_index!r:>9}", "{chunk_index:{file_index}}", "{0}", "{other}", "{chunk_index", 7]
-PLACED = "warmprior.json: observations is"
+PLACED = ["warmprior.json", "observations"]
 
 META = {
-    "v2.1": (v21, ["LeRobotDataset v2.1", "convert_dataset_v21_to_v30"]),
-    **{name: (change, [f"meta/info.json has {name}="]) for name, change in MALFORMED.items()},
-    **{f"at {text}": (info_of("data_path", text), ["has data_path="]) for text in TEMPLATES},
-    "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["has its content=[]"]),
+    "v2.1": (v21, ["v2.1", "convert_dataset_v21_to_v30"]),
+    **{name: (change, ["meta/info.json", f"{name}="]) for name, change in MALFORMED.items()},
+    **{f"at {text}": (info_of("data_path", text), ["data_path="]) for text in TEMPLATES},
+    "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),
     "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
-    "no length": (table(EPISODES, length=entry(0, None, None)), ["numbers of at least 0 as length"]),
-    "no observations": (described(), [PLACED]),
-    "listed observations": (described(observations=["object"]), [PLACED]),
-    "two ends": (described(observations={"object": ["observation.environment_state", 10]}), [PLACED]),
-    "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), [PLACED]),
-    "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json: masks is"]),
-    "no JSON": (cut("meta/info.json"), ["LeRobot cannot read", "again"]),
-    "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
-    "other fps": (info(lambda i: i.update(fps=30)), ["fps is 30", "Lift", "20 Hz", "resample"]),
+    "no length": (table(EPISODES, length=entry(0, None, None)), ["length"]),
+    "no observations": (described(), PLACED),
+    "listed observations": (described(observations=["object"]), PLACED),
+    "two ends": (described(observations={"object": ["observation.environment_state", 10]}), PLACED),
+    "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), PLACED),
+    "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json", "masks"]),
+    "no JSON": (cut("meta/info.json"), ["LeRobot"]),
+    "no episodes": (without(EPISODES), ["meta/episodes/*/*.parquet", "finalize()"]),
+    "other fps": (info(lambda i: i.update(fps=30)), ["fps", 30, "Lift", 20]),
     "no action": (
         info(lambda i: i["features"].update({"act": i["features"].pop("action")})),
-        ["no vector of numbers 'action'", "task_index, act"],
+        ["'action'", "task_index, act"],
     ),
     "joints": (
         feature("action", names={"motors": [f"joint_{i}" for i in range(7)]}),
-        ["actions of Lift are robot0_x, robot0_y", "joint_0, joint_1", "to null"],
+        ["Lift", "robot0_x, robot0_y", "joint_0, joint_1"],
     ),
     "another environment": (
         described(env_args={"env_name": "Stack", "env_kwargs": {}}, observations=STATE),
-        ["recorded in Stack, not in Lift", "env_args"],
+        ["Stack", "Lift", "env_args"],
     ),
     "other columns": (
         described(observations={"object": ["observation.state", 3, 13]}),
-        ["warmprior.json: observations['object']", "observation.state", "convert"],
+        ["warmprior.json", "observations['object']", "observation.state"],
     ),
 }
-
-
-PLACE = ["damaged", "is not where meta/episodes says", "finalize()"]
 VALUES = {
-    "cut off": (cut(DATA), ["damaged", "finalize()", "again"]),
-    "NaN": (
-        table(DATA, action=entry(8, float("nan"))),
-        ["action of episode 2", "nan in row 1", "Record"],
-    ),
-    "other episodes": (table(DATA, episode_index=entry(6, 0, None)), PLACE),
+    "cut off": (cut(DATA), ["damaged", "finalize()"]),
+    "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
+    "other episodes": (table(DATA, episode_index=entry(6, 0, None)), ["meta/episodes", "finalize()"]),
 }
-
-
+MOVIE = "videos/observation.images.side/chunk-000/file-000.mp4"
 IMAGES = {
-    "missing camera": (
-        lambda root: None,
-        ["no images 'front_image'", "agentview_image"],
-        "front_image",
-    ),
-    "not square": (feature(CAMERA, shape=[32, 16, 3]), ["only square"], "agentview_image"),
+    "missing camera": (lambda root: None, ["'front_image'", "agentview_image"], "front_image"),
+    "not square": (feature(CAMERA, shape=[32, 16, 3]), ["square"], "agentview_image"),
     "other size": (
         feature(CAMERA, shape=[16, 16, 3]),
         [DATA, CAMERA, "3, 32, 32]", "3, 16, 16]"],
         "agentview_image",
     ),
-    "cut-off video": (
-        cut("videos/observation.images.side/chunk-000/file-000.mp4"),
-        ["file-000.mp4: damaged"],
-        "side_image",
-    ),
+    "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
 }
 
 
@@ -183,25 +163,23 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
     change(root)
     if name in META:
         monkeypatch.setattr("warmprior.data.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
-    with pytest.raises(DatasetError) as caught:
+    with raises(DatasetError, root / DATA if name in VALUES else root, *said):
         LeRobotDemonstrations(root, env_args=LIFT, image_keys=keys)
-    for word in [str(root / DATA if name in VALUES else root), *said]:
-        assert word in str(caught.value)
 
 
 def test_masks_and_episodes_are_some_of_those_that_there_are(root):
     described(observations=STATE, masks={"none": [], "more": [0, 3], "floats": [0.5], "ok": [2, 0]})(root)
     seen = {"observation_keys": ["observation.state"]}
     for options in ({"filter_key": "none"}, {"episodes": []}, {"filter_key": "ok", "episodes": [1]}):
-        with pytest.raises(DatasetError, match="the mask"):
+        with raises(DatasetError, "mask"):
             LeRobotDemonstrations(root, **options, **seen)
     assert LeRobotDemonstrations(root, filter_key="ok", episodes=[2], **seen).num_episodes == 1
     for name in ("more", "floats"):
-        with pytest.raises(DatasetError, match=rf"the mask '{name}' must be some of the episodes 0 to 2"):
+        with raises(DatasetError, f"'{name}'", "0 to 2"):
             LeRobotDemonstrations(root, filter_key=name, **seen)
     assert LeRobotDemonstrations(root, filter_key="ok", **seen).num_episodes == 2
     for numbers in ([3], [-1], [True], ["0"]):
-        with pytest.raises(DatasetError, match="episodes must be some of the episodes 0 to 2"):
+        with raises(DatasetError, "episodes", "0 to 2"):
             LeRobotDemonstrations(root, episodes=numbers, **seen)
 
 
@@ -212,37 +190,32 @@ def test_files_of_other_episodes_are_not_needed(tmp_path):
     assert torch.equal(data["action"], torch.from_numpy(np.delete(values["action"], range(12, 24), 0)))
 
 
-@pytest.mark.parametrize(
-    ("dtype", "shape", "said"),
-    [("float32", (2, 3), "shape [2, 3]"), ("string", (1,), "dtype string")],
-)
-def test_observations_that_are_no_vectors_are_named(tmp_path, dtype, shape, said):
-    write_lerobot(tmp_path / "data")
-    feature("observation.state", dtype=dtype, shape=list(shape))(tmp_path / "data")
-    with pytest.raises(DatasetError, match=r"'observation\.state' has dtype") as caught:
-        LeRobotDemonstrations(tmp_path / "data", observation_keys=["observation.state"])
-    assert said in str(caught.value)
+@pytest.mark.parametrize(("dtype", "shape"), [("float32", [2, 3]), ("string", [1])])
+def test_observations_that_are_no_vectors_are_named(root, dtype, shape):
+    feature("observation.state", dtype=dtype, shape=shape)(root)
+    with raises(DatasetError, "'observation.state'", dtype, shape):
+        LeRobotDemonstrations(root, observation_keys=["observation.state"])
 
 
 def test_bad_options(root):
-    with pytest.raises(ValueError, match="'disk'"):
+    with raises(ValueError, "'disk'"):
         LeRobotDemonstrations(root, storage="disk")
-    with pytest.raises(FileNotFoundError, match=r"no meta/info\.json there"):
+    with raises(FileNotFoundError, "meta/info.json"):
         LeRobotDemonstrations(root / "absent")
-    with pytest.raises(DatasetError, match=r"3 demonstrations.*demos=4"):
+    with raises(DatasetError, 3, "demos=4"):
         LeRobotDemonstrations(root, demos=4)
-    with pytest.raises(ValueError, match=r"demos must be .*at least 1, got 0"):
+    with raises(ValueError, "demos", 0):
         LeRobotDemonstrations(root, demos=0)
-    with pytest.raises(DatasetError, match=r"no observation 'nothing'.*observation.state"):
+    with raises(DatasetError, "'nothing'", "observation.state"):
         LeRobotDemonstrations(root, observation_keys=["nothing"])
-    with pytest.raises(DatasetError, match=r"'observation\.images\.side' is an image.*image_keys"):
+    with raises(DatasetError, "'observation.images.side'", "image_keys"):
         LeRobotDemonstrations(root, observation_keys=["observation.images.side"])
-    with pytest.raises(DatasetError, match="no observations are chosen"):
+    with raises(DatasetError, "observations"):
         LeRobotDemonstrations(root, observation_keys=[])
-    with pytest.raises(DatasetError, match=r"filter key 'train'.* none"):
+    with raises(DatasetError, "'train'", "none"):
         LeRobotDemonstrations(root, filter_key="train")
-    with pytest.raises(DatasetError, match="no observation 'robot0_eef_pos'"):
+    with raises(DatasetError, "'robot0_eef_pos'"):
         read_lerobot_index(root, poses=True)
     # Poses that are none: random numbers where a quaternion should be.
-    with pytest.raises(DatasetError, match=r"robot0_eef_quat\) of episode 0 .*rotation in row"):
+    with raises(DatasetError, "robot0_eef_quat", "episode 0", "row"):
         LeRobotDemonstrations(root, env_args=LIFT, absolute_actions=True)

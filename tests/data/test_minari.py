@@ -1,11 +1,11 @@
 """Datasets of Minari against Minari's own reader, and their environments."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
+
+from tests.errors import raises
 
 minari = pytest.importorskip("minari")
 
@@ -50,7 +50,6 @@ def drawn(space, rng, length):
 
 
 def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, **options):
-    """A dataset of three episodes, and its name."""
     rng = np.random.default_rng(0)
     buffers = [
         EpisodeBuffer(
@@ -89,25 +88,24 @@ def test_entries_of_dictionaries_are_chosen_by_name():
     np.testing.assert_array_equal(data["observation", "state"], expected)
     np.testing.assert_array_equal(data["observation", "front"], own["front"][:-1].transpose(0, 3, 1, 2))
     assert MinariDemonstrations(name).observation_keys == ("arm", "goal/place")
-    for wrong in ({"observation_keys": ["leg"]}, {"image_keys": ["side"]}):
-        with pytest.raises(DatasetError, match=r"leg.*arm, goal/place|side.*front"):
+    for wrong, facts in (
+        ({"observation_keys": ["leg"]}, ("leg", "arm, goal/place")),
+        ({"image_keys": ["side"]}, ("side", "front")),
+    ):
+        with raises(DatasetError, *facts):
             MinariDemonstrations(name, **wrong)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"action": Discrete(3)}, "Discrete"),
-        ({"action": Box(-1, 1, (2, 2), np.float32)}, r"\(2, 2\)"),
-    ],
+    ("action", "fact"), [(Discrete(3), "Discrete"), (Box(-1, 1, (2, 2), np.float32), "(2, 2)")]
 )
-def test_actions_that_are_no_vector_are_refused(options, said):
-    with pytest.raises(DatasetError, match=said):
-        MinariDemonstrations(written(**options))
+def test_actions_that_are_no_vector_are_refused(action, fact):
+    with raises(DatasetError, fact):
+        MinariDemonstrations(written(action=action))
 
 
 def test_what_there_is_not(root):
-    with pytest.raises(FileNotFoundError, match=r"toy/none/human-v0.*MINARI_DATASETS_PATH"):
+    with raises(FileNotFoundError, "toy/none/human-v0", "MINARI_DATASETS_PATH"):
         MinariDemonstrations("toy/none/human-v0")
     name = written()
     for options in ({"filter_key": "train"}, {"absolute_actions": True}, {"demos": 4}):
@@ -115,7 +113,7 @@ def test_what_there_is_not(root):
             MinariDemonstrations(name, **options)
     (data,) = root.rglob("main_data.hdf5")
     data.write_bytes(data.read_bytes()[:900])
-    with pytest.raises(DatasetError, match="walk/human-v0"):
+    with raises(DatasetError, "walk/human-v0"):
         MinariDemonstrations(name)
 
 
@@ -143,7 +141,7 @@ def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "1 demonstrations" in said and "NFE 1" in said and "NFE 9" in said
     task = Task.open(place)
-    with pytest.raises(ValueError, match="environment"):
+    with raises(ValueError, "environment"):
         task.make_env()
 
 
@@ -154,7 +152,7 @@ def test_nothing_named_in_a_dataset_is_imported(root):
     for other in ("evil-v1", "evil:Pendulum-v1"):
         metadata.write_text(text.replace("Pendulum-v1", other))
         task = Task.open(f"minari:{name}")
-        with pytest.raises(ImportError, match=other):
+        with raises(ImportError, other):
             task.make_env()
     entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
     assert entry in text

@@ -5,8 +5,6 @@ the damage is a change that the format cannot tell from a choice); refused with 
 file; or a failure, which is listed. The exit code is 1 if there is any.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -41,10 +39,8 @@ def main() -> int:
                 outcome = attempt(load, names)
                 counts["failures" if outcome.failed else outcome.kind] += 1
                 if outcome.failed:
-                    print(
-                        f"{subject.name}, seed {seed} ({how}): {outcome.kind}: {outcome.detail}",
-                        file=sys.stderr,
-                    )
+                    place = f"{subject.name}, seed {seed} ({how})"
+                    print(f"{place}: {outcome.kind}: {outcome.detail}", file=sys.stderr)
         cells = [counts[kind] for kind in ("equal", "as stored", "refused", "failures")]
         row = [subject.name, args.cases, *cells, f"{time.monotonic() - started:.0f}"]
         print("| " + " | ".join(map(str, row)) + " |", flush=True)

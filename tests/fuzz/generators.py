@@ -1,7 +1,5 @@
 """Files to damage, and the ways to do so: demonstrations, policies, training states and results."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -19,8 +17,11 @@ from lab.options import Options, with_parts
 from lab.presets import PRESETS
 from lab.rows import PLAYED, read_rows
 from lab.stored_options import recorded, stored_options
+from tests.data.hdf5_faults import FAULTS, NUMBERS, replace
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.sandbox import Outcome
+from tests.lab.test_rows import ROW
+from tests.states import same
 from tests.training.cloning_parts import CONFIG, training
 from warmprior import (
     ChiTransformer,
@@ -93,118 +94,25 @@ def odd_json(value: Any, rng: np.random.Generator) -> str:
     return f"{key} = {new!r}"
 
 
-# --- demonstration files
-
-KEYS = ("actions", "rewards", "obs/object", "obs/robot0_eef_pos", "obs/robot0_eef_quat")
+def damage_content(path: Path, rng: np.random.Generator) -> str:
+    """Damage a file, or, where it is JSON, mostly one of its entries; returns how."""
+    if path.suffix != ".json" or rng.random() >= 0.7:
+        return damage(path, rng)
+    content = json.loads(path.read_text())
+    how = odd_json(content, rng)
+    path.write_text(json.dumps(content))
+    return how
 
 
 def make_demonstrations(folder: Path) -> None:
-    """Write the whole files: contiguous, and in compressed chunks with checksums."""
     write_robomimic_file(folder / "plain.hdf5", masks={"train": [0, 2]})
     write_robomimic_file(folder / "packed.hdf5", masks={"train": [0, 2]})
     with h5py.File(folder / "packed.hdf5", "a") as file:
         for demo in file["data"].values():
-            for key in (*KEYS, "obs/robot0_gripper_qpos"):
+            for key in (*NUMBERS, "obs/robot0_gripper_qpos"):
                 values = demo[key][()]
-                del demo[key]
-                demo.create_dataset(
-                    key, data=values, chunks=(4, *values.shape[1:]), compression="gzip", fletcher32=True
-                )
-
-
-# --- what HDF5 allows, and no recording holds: each has to be refused
-def _external_storage(file, name, folder, rng):
-    shape = file[name].shape
-    (folder / "other").write_bytes(bytes(8 * int(np.prod(shape))))
-    _new(file, name, shape=shape, dtype="f8", external=[(str(folder / "other"), 0, h5py.h5f.UNLIMITED)])
-
-
-def _external_link(file, name, folder, rng):
-    shape = file[name].shape
-    with h5py.File(folder / "other.hdf5", "w") as other:
-        other["x"] = np.zeros(shape)
-    del file[name]
-    file[name] = h5py.ExternalLink(str(folder / "other.hdf5"), "x")
-
-
-def _virtual(file, name, folder, rng):
-    shape = file[name].shape
-    del file[name]
-    layout = h5py.VirtualLayout(shape, "f8")
-    layout[:] = h5py.VirtualSource(str(folder / "absent.hdf5"), "x", shape)
-    file.create_virtual_dataset(name, layout)
-
-
-def _never_written(file, name, folder, rng):
-    chunks = (2, *file[name].shape[1:]) if rng.random() < 0.5 else None
-    _new(file, name, shape=file[name].shape, dtype="f8", chunks=chunks)
-
-
-def _many_rows(file, name, folder, rng):
-    shape = (10 ** int(rng.integers(6, 12)), *file[name].shape[1:])
-    _new(file, name, shape=shape, dtype="f8", chunks=(1024, *shape[1:]), compression="gzip")
-
-
-def _all_with_many_rows(file, name, folder, rng):
-    rows = 10 ** int(rng.integers(6, 10))
-    demo = file["data/demo_0"]
-    for key in (*KEYS, "obs/robot0_gripper_qpos"):
-        shape = (rows, *demo[key].shape[1:])
-        _new(demo, key, shape=shape, dtype="f8", chunks=(1024, *shape[1:]), compression="gzip")
-
-
-def _huge_chunk(file, name, folder, rng):
-    shape = file[name].shape
-    chunks = (int(rng.integers(40_000_000, 60_000_000)), *shape[1:])
-    chunks = (min(chunks[0], 2**32 // 8 // int(np.prod(shape[1:], initial=1)) - 1), *shape[1:])
-    _new(file, name, shape=shape, dtype="f8", chunks=chunks, maxshape=(None, *shape[1:]))
-
-
-def _group(file, name, folder, rng):
-    del file[name]
-    file.create_group(name)
-
-
-def _empty(file, name, folder, rng):
-    del file[name]
-    file[name] = h5py.Empty("f8")
-
-
-def _another_type(file, name, folder, rng):
-    dtype = ["S3", "c16", [("a", "f8")], h5py.string_dtype()][int(rng.integers(4))]
-    _new(file, name, shape=file[name].shape, dtype=dtype)
-
-
-def _another_shape(file, name, folder, rng):
-    shape = list(file[name].shape)
-    shape[0] += int(rng.choice([-1, 1, 1000]))
-    values = np.zeros([*shape, *([2] * int(rng.integers(2)))])
-    del file[name]
-    file[name] = values
-
-
-def _missing(file, name, folder, rng):
-    del file[name]
-
-
-def _bad_value(file, name, folder, rng):
-    file[name][0, ...] = rng.choice([np.nan, np.inf, -np.inf, 1e38, -1e38, 1e300])
-
-
-def _loop(file, name, folder, rng):
-    del file[name]
-    file[name] = h5py.SoftLink("/" + name)
-
-
-REFUSED = (
-    *(_external_storage, _external_link, _virtual, _never_written, _many_rows, _huge_chunk),
-    *(_all_with_many_rows, _group, _empty, _another_type, _another_shape, _missing, _bad_value, _loop),
-)
-
-
-def _new(file, name, **options):
-    del file[name]
-    file.create_dataset(name, **options)
+                packed = {"chunks": (4, *values.shape[1:]), "compression": "gzip", "fletcher32": True}
+                replace(demo, key, data=values, **packed)
 
 
 def _odd_env_args(file, rng):
@@ -221,7 +129,6 @@ def _odd_mask(file, rng):
 
 
 def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
-    """Damage one of the files."""
     whole = folder / str(rng.choice(["plain.hdf5", "packed.hdf5"]))
     path = folder / "case.hdf5"
     path.write_bytes(whole.read_bytes())
@@ -237,10 +144,10 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
                 how, must_refuse, masked = "mask", True, True
                 _odd_mask(file, rng)
             else:
-                change = REFUSED[int(rng.integers(len(REFUSED)))]
-                name = f"data/demo_{rng.choice([0, 2])}/{rng.choice(KEYS)}"
-                how, must_refuse = f"{change.__name__[1:]} {name}", True
-                change(file, name, folder, rng)
+                fault = str(rng.choice(list(FAULTS)))
+                name = f"data/demo_{rng.choice([0, 2])}/{rng.choice(NUMBERS)}"
+                how, must_refuse = f"{fault} {name}", True
+                FAULTS[fault](file, name, folder)
     options = {"filter_key": "train" if masked else None, "absolute_actions": bool(rng.random() < 0.3)}
 
     def load() -> Outcome:
@@ -248,8 +155,8 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
         if must_refuse:
             return Outcome("silent", "was read")
         expected = RobomimicDemonstrations(whole, **options)
-        same = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
-        if same and replay.env_args == expected.env_args:
+        equal = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
+        if equal and replay.env_args == expected.env_args:
             return Outcome("equal")
         # HDF5 keeps no checksum of plain values: then the file must say so to any reader.
         return Outcome("as stored") if _says_so(path, replay, options) else Outcome("silent", "differs")
@@ -278,11 +185,7 @@ def _says_so(path: Path, replay: RobomimicDemonstrations, options: dict) -> bool
     return equal and replay.env_args == modernize_env_args(meta)
 
 
-# --- LeRobotDatasets
-
-
 def make_datasets(folder: Path) -> None:
-    """Convert demonstrations; the folder of cases is theirs with one file in it replaced."""
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(6, 9), task="lift", masks={"train": [0]})
     convert_robomimic(path, folder / "whole")
@@ -294,26 +197,20 @@ def mutate_datasets(folder: Path, rng: np.random.Generator) -> Case:
     shutil.rmtree(case, ignore_errors=True)
     shutil.copytree(whole, case)
     # What LeRobot's own statistics and tasks are is read by nobody here.
-    files = sorted(
-        p for p in case.rglob("*") if p.is_file() and p.name not in ("stats.json", "tasks.parquet")
-    )
+    unread = ("stats.json", "tasks.parquet")
+    files = sorted(p for p in case.rglob("*") if p.is_file() and p.name not in unread)
     path = files[int(rng.integers(len(files)))]
-    if path.suffix == ".json" and rng.random() < 0.7:
-        content = json.loads(path.read_text())
-        how = odd_json(content, rng)
-        path.write_text(json.dumps(content))
-    else:
-        how = damage(path, rng)
+    how = damage_content(path, rng)
     options = {"filter_key": "train" if rng.random() < 0.3 else None, "absolute_actions": rng.random() < 0.3}
 
     def load() -> Outcome:
         replay, expected = (LeRobotDemonstrations(place, **options) for place in (case, whole))
-        same = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
-        if same and replay.env_args == expected.env_args:
+        equal = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
+        if equal and replay.env_args == expected.env_args:
             return Outcome("equal")
         # Neither JSON nor parquet, as LeRobot writes it, keeps a checksum: another option of the environment,
         # or another number, is another recording's.
-        stored = same if path.suffix == ".json" else _table_says_so(case, replay, options)
+        stored = equal if path.suffix == ".json" else _table_says_so(case, replay, options)
         ok = stored and replay.task == expected.task
         return Outcome("as stored") if ok else Outcome("silent", "differs")
 
@@ -338,23 +235,12 @@ def _table_says_so(folder: Path, replay: LeRobotDemonstrations, options: dict) -
     return all(torch.equal(mine, theirs) for mine, theirs in pairs)
 
 
-# --- results, and the options of a run
-
-ROW = {
-    **{"task": "lift", "data": "ph", "prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0},
-    **{"iterations": 30, "policy": "lift-ph-past-seed0", "checkpoint": 30, "nfe": 9, "mean_steps": 31.5},
-    **{"episodes": 4, "successes": 3, "success_rate": 0.75, "outcomes": "1011", "kappa": None},
-}
-
-
 def make_rows(folder: Path) -> None:
-    """Write rows of a few cells."""
     rows = [ROW | {"seed": seed, "nfe": nfe, "policy": f"past-{seed}"} for seed in (0, 1) for nfe in (9, 1)]
     (folder / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
 def mutate_rows(folder: Path, rng: np.random.Generator) -> Case:
-    """Damage a file of rows."""
     whole, path = folder / "results.jsonl", folder / "case.jsonl"
     rows = [json.loads(line) for line in whole.read_text().splitlines()]
     if rng.random() < 0.7:
@@ -379,7 +265,6 @@ def mutate_rows(folder: Path, rng: np.random.Generator) -> Case:
 
 
 def make_options(folder: Path) -> None:
-    """Write the options of a run on a file of demonstrations."""
     (folder / "case").mkdir()
     path = folder / "lift.hdf5"
     path.touch()
@@ -389,15 +274,9 @@ def make_options(folder: Path) -> None:
 
 
 def mutate_options(folder: Path, rng: np.random.Generator) -> Case:
-    """Damage options of a run."""
     whole, path = folder / "options.json", folder / "case" / "options.json"
     path.write_bytes(whole.read_bytes())
-    if rng.random() < 0.7:
-        content = json.loads(whole.read_text())
-        how = odd_json(content, rng)
-        path.write_text(json.dumps(content))
-    else:
-        how = damage(path, rng)
+    how = damage_content(path, rng)
 
     def load() -> Outcome:
         options = stored_options(Options, path.parent, "robomimic")
@@ -406,18 +285,14 @@ def mutate_options(folder: Path, rng: np.random.Generator) -> Case:
         except (ValueError, OSError) as error:  # which names the option
             return Outcome("refused" if "--" in str(error) else "unclear", str(error))
         tree = json.loads(path.read_bytes())["options"]
-        same = tree == json.loads(whole.read_text())["options"]
+        equal = tree == json.loads(whole.read_text())["options"]
         found = recorded(options) == tree
-        return Outcome("equal" if same else "as stored") if found else Outcome("silent", "differs")
+        return Outcome("equal" if equal else "as stored") if found else Outcome("silent", "differs")
 
     return how, load, str(path)
 
 
-# --- saved policies and training states
-
-
 def make_policies(folder: Path) -> None:
-    """Save two policies."""
     torch.manual_seed(0)
     data = TensorDict({"observation": torch.randn(50, 5), "action": torch.randn(50, 2)}, [50])
     networks = {
@@ -430,7 +305,6 @@ def make_policies(folder: Path) -> None:
 
 
 def make_states(folder: Path) -> None:
-    """Train a little."""
     training(folder / "whole", CONFIG).run(None)
 
 
@@ -456,9 +330,8 @@ def mutate_policies(folder: Path, rng: np.random.Generator) -> Case:
         actor, expected = load_policy(case), load_policy(whole)
         if signed:
             return _plays(actor)
-        state, theirs = actor.state_dict(), expected.state_dict()
-        same = state.keys() == theirs.keys() and all(torch.equal(state[n], theirs[n]) for n in state)
-        if same and policy_config(actor) == policy_config(expected):
+        equal = same(actor.state_dict(), expected.state_dict())
+        if equal and policy_config(actor) == policy_config(expected):
             return Outcome("equal")
         return Outcome("silent", "differs")
 
@@ -481,8 +354,7 @@ def _odd_tensor(tensors: dict[str, torch.Tensor], rng: np.random.Generator) -> s
 
 def _plays(actor: WarmPriorActor) -> Outcome:
     """Whether a policy that was loaded makes a decision, and of numbers."""
-    observation = torch.zeros(1, 2, 5)
-    data = TensorDict({actor.observation_key: observation}, [1])
+    data = TensorDict({actor.observation_key: torch.zeros(1, 2, 5)}, [1])
     lengths = actor.prior.history_length, actor.prior.prediction_length
     data.set(actor.history_key, cold_history([1], *lengths, 2))
     with torch.no_grad():
@@ -492,7 +364,6 @@ def _plays(actor: WarmPriorActor) -> Outcome:
 
 
 def mutate_states(folder: Path, rng: np.random.Generator) -> Case:
-    """Damage a state."""
     whole, case = folder / "whole" / "state.safetensors", folder / "case"
     how = damaged_copy(whole, case, rng)
 
@@ -504,25 +375,17 @@ def mutate_states(folder: Path, rng: np.random.Generator) -> Case:
             **named("ema", module_tensors(cloning.update.ema)),
             **named("optimizer", snapshot_optimizer(cloning.update.optimizer)),
         }
-        restored = all(torch.equal(stored[name], value) for name, value in mine.items())
-        same = (cloning.iteration, [list(pair) for pair in cloning.losses]) == (
-            facts["iteration"],
-            facts["losses"],
-        )
-        return Outcome("equal") if restored and same else Outcome("silent", "differs")
+        restored = same(mine, {name: stored[name] for name in mine})
+        progress = {"iteration": cloning.iteration, "losses": [list(pair) for pair in cloning.losses]}
+        equal = restored and progress.items() <= facts.items()
+        return Outcome("equal") if equal else Outcome("silent", "differs")
 
     return how, load, str(case / whole.name)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A kind of file.
-
-    Attributes:
-        name: of the kind.
-        make: writes whole files into a folder.
-        mutate: damages a copy of one.
-    """
+    """A kind of file: ``make`` writes whole ones into a folder, and ``mutate`` damages a copy of one."""
 
     name: str
     make: Callable[[Path], None]

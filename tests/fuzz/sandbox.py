@@ -1,7 +1,5 @@
 """One load in a process of its own: what came of it, how long it took and how much memory."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

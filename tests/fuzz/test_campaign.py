@@ -1,7 +1,5 @@
 """The instrument itself: it finds what it is for, and its cases repeat."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
