@@ -1,17 +1,14 @@
 """A small DSRL-NA loss and a batch for it, with every kind of episode end."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import ValueEstimators
 
+from tests.toy_env import mlp_actor
 from warmprior import (
     DSRLNALoss,
     PastPrior,
     PriorDecoder,
-    VelocityMLP,
-    WarmPriorActor,
     keys,
     make_prior_space_actor,
     make_prior_space_critic,
@@ -21,10 +18,8 @@ H, D_A, D_O, TO, N = 2, 2, 3, 2, 6
 GAMMA = 0.9
 
 
-def make_decoder(prior, delta=0.5, **options):
-    torch.manual_seed(7)
-    network = VelocityMLP(D_A, D_O, prior.prediction_length, TO, hidden_dim=8)
-    return PriorDecoder(WarmPriorActor(network, prior, nfe=2), delta=delta, **options)
+def make_decoder(prior, delta=0.5):
+    return PriorDecoder(mlp_actor(prior, D_A, D_O, nfe=2), delta=delta)
 
 
 def build(prior=None, delta=0.5, decoder=None, hidden_dim=8, **options):

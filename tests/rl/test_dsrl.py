@@ -1,7 +1,5 @@
 """DSRL-NA against equations written by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -10,13 +8,12 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
+from tests.errors import raises
 from tests.rl.dsrl_parts import GAMMA, H, N, batch, build
 from warmprior import PastPrior, PreviewPrior, PriorDecoder, ResidualSampler, WarmPriorActor, keys
 
 
 def networks(loss):
-    """Plain copies of the loss's networks: actor, critics, target critics, noise critics."""
-
     def of(name, params):
         out = []
         for i in range(2):
@@ -100,9 +97,9 @@ def test_losses_by_hand(prior_class, options, delta):
     torch.manual_seed(5)
     original = data.clone()
     out = loss.reinforcement_loss(data)
-    torch.testing.assert_close(out["loss_qvalue"], loss_q, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(out["loss_actor"], loss_actor, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(out["loss_alpha"], loss_alpha, rtol=1e-4, atol=1e-4)
+    expected = {"qvalue": loss_q, "actor": loss_actor, "alpha": loss_alpha}
+    for name, value_ in expected.items():
+        torch.testing.assert_close(out[f"loss_{name}"], value_, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(out["entropy"], -log_prob.mean(), rtol=1e-4, atol=1e-4)
     td_error = torch.stack(errors).abs().amax(0)
     torch.testing.assert_close(data["td_error"], td_error, rtol=1e-4, atol=1e-4)
@@ -117,16 +114,12 @@ def test_distillation_by_hand(distribution):
     loss.distillation.generator = torch.Generator().manual_seed(2)
     data = batch()
     _, q, _, q_noise = networks(loss)
-    sampler = ResidualSampler(
-        loss.decoder, distribution=distribution, generator=torch.Generator().manual_seed(2)
-    )
-    delta = sampler(data.clone())["prior", "delta"]
+    options = {"distribution": distribution, "generator": torch.Generator().manual_seed(2)}
+    delta = ResidualSampler(loss.decoder, **options)(data.clone())["prior", "delta"]
     chunk = decode(loss, data["observation"], data["prior", "anchor"] + delta)
     inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
-    parameters = [list(c.parameters()) for c in q_noise]
-    for group in parameters:
-        for p in group:
-            p.requires_grad_(True)
+    for critic in q_noise:
+        critic.requires_grad_(True)
     expected = torch.zeros(())
     for critic, noise_critic in zip(q, q_noise, strict=True):
         with torch.no_grad():
@@ -175,12 +168,7 @@ def test_training_reaches_a_known_optimum():
             return torch.zeros_like(a)
 
     decoder = PriorDecoder(WarmPriorActor(Still(), PastPrior(H), nfe=1), delta=0.5)
-    loss = build(
-        decoder=decoder,
-        hidden_dim=64,
-        alpha_init=0.3,
-        distillation="uniform",
-    )
+    loss = build(decoder=decoder, hidden_dim=64, alpha_init=0.3, distillation="uniform")
     loss.log_alpha.requires_grad_(False)
     states = batch()[:1].expand(256).clone()
     states["next", "done"] = torch.ones(256, 1, dtype=torch.bool)
@@ -209,5 +197,5 @@ def test_schedule():
     names = [compute.__name__ for compute in loss.schedule(updates=2)]
     assert names == ["reinforcement_loss"] * 2 + ["distillation_loss"] * 3
     assert [c.__name__ for c in build().schedule(20)].count("distillation_loss") == 10
-    with pytest.raises(ValueError, match="updates must be a whole number of at least 1"):
+    with raises(ValueError, "updates"):
         loss.schedule(0)

@@ -1,7 +1,3 @@
-"""PriorSpace: the other wiring of the decoder, with the same transitions."""
-
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
@@ -11,8 +7,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.errors import raises
 from tests.rl.training_parts import SolvableEnv
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
 from warmprior import (
     ActionHistory,
     ChunkStep,
@@ -22,8 +19,7 @@ from warmprior import (
     PriorAnchor,
     PriorDecoder,
     PriorSpace,
-    VelocityMLP,
-    WarmPriorActor,
+    keys,
     make_prior_space_actor,
     policy_transforms,
 )
@@ -31,20 +27,19 @@ from warmprior.training import play_episode
 
 H, TO, D_O, DELTA = 3, 2, 2 + ACTION_DIM, 0.5
 LENGTHS = (7, 4)
-WHERE = {
-    ("prior", "noise"): ("next", "decoded", "noise"),
-    ("vla_action", "chunk"): ("next", "decoded", "chunk"),
-}
+WHERE = {keys.NOISE: ("next", "decoded", "noise"), keys.CHUNK: ("next", "decoded", "chunk")}
 
 
-def make_actor(prior):
-    torch.manual_seed(0)
-    network = VelocityMLP(ACTION_DIM, D_O, prior.prediction_length, TO, hidden_dim=8)
-    return WarmPriorActor(network, prior, nfe=2, clip=1.0)
+make_actor = partial(mlp_actor, nfe=2, clip=1.0)
 
 
-def make_decoder(prior, delta=DELTA):
-    return PriorDecoder(make_actor(prior), delta=delta)
+def make_decoder(prior):
+    return PriorDecoder(make_actor(prior), delta=DELTA)
+
+
+def make_agent(prior):
+    sizes = ACTION_DIM, D_O, prior.prediction_length, TO
+    return make_prior_space_actor(*sizes, delta=DELTA, hidden_dim=8)
 
 
 def transforms_of(prior, decoder=None, **options):
@@ -65,8 +60,7 @@ def make_env(prior, decoder=None, batched=SerialEnv, truncate=False, **options):
 def test_both_wirings_give_bit_identical_transitions(prior_class, collect, execute):
     prior = prior_class(H)
     decoder = make_decoder(prior)
-    agent = make_prior_space_actor(ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8)
-    results = []
+    agent, results = make_agent(prior), []
     for inside in (False, True):
         env = make_env(prior, decoder if inside else None, execute=execute)
         policy = agent if inside else TensorDictSequential(agent, decoder)
@@ -79,9 +73,9 @@ def test_both_wirings_give_bit_identical_transitions(prior_class, collect, execu
         else:
             results.append(env.rollout(9, policy, break_when_any_done=False))
     outside, inside = results
-    keys = [key for key in outside.keys(True, True) if "collector" not in key]
-    assert {"observation", *WHERE, ("next", "prior", "anchor")} <= set(keys)
-    for key in keys:
+    names = [key for key in outside.keys(True, True) if "collector" not in key]
+    assert {"observation", *WHERE, ("next", "prior", "anchor")} <= set(names)
+    for key in names:
         assert torch.equal(outside[key], inside[WHERE.get(key, key)]), key
     assert outside["next", "done"].sum() >= 3
 
@@ -89,8 +83,7 @@ def test_both_wirings_give_bit_identical_transitions(prior_class, collect, execu
 @pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
 def test_specs_and_random_actions(batched):
     prior = PreviewPrior(H)
-    env = make_env(prior, make_decoder(prior), batched)
-    try:
+    with closing(make_env(prior, make_decoder(prior), batched)) as env:
         check_env_specs(env)
         assert env.action_keys == [("prior", "delta")]
         spec = env.full_action_spec["prior", "delta"]
@@ -107,22 +100,19 @@ def test_specs_and_random_actions(batched):
         assert torch.equal(data["next", "observation"][..., -1, 2:], last.squeeze(-2))
         noise = data["next", "decoded", "noise"]
         assert torch.equal(noise, data["prior", "anchor"] + delta)
-    finally:
-        env.close(raise_if_closed=False)
 
 
 def test_an_episode_of_an_agent_has_the_decoded_chunks():
     prior = PastPrior(H)
     env = TransformedEnv(SolvableEnv(LENGTHS[0]), transforms_of(prior, make_decoder(prior)))
-    agent = make_prior_space_actor(ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8)
-    decisions = play_episode(agent, env, seed=0).decisions
+    decisions = play_episode(make_agent(prior), env, seed=0).decisions
     assert decisions["vla_action", "chunk"].shape[-2:] == (H, ACTION_DIM)
 
 
 def test_without_anchor_or_chunks():
     decoder = make_decoder(PastPrior(H))
     chain = Compose(ChunkStep(H), ActionHistory(H), PriorSpace(decoder))
-    with pytest.raises(KeyError, match="append it after PriorAnchor"):
+    with raises(KeyError, "PriorAnchor"):
         TransformedEnv(CountingEnv(7), chain).rollout(1)
-    with pytest.raises(KeyError, match="append ChunkStep first"):
+    with raises(KeyError, "ChunkStep"):
         TransformedEnv(CountingEnv(7), PriorSpace(decoder)).full_action_spec  # noqa: B018

@@ -1,6 +1,4 @@
-"""Agents around a policy that sees images: they read what its frozen encoder makes of them."""
-
-from __future__ import annotations
+from functools import partial
 
 import pytest
 import torch
@@ -10,6 +8,7 @@ from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
+from tests.errors import raises
 from tests.rl.training_parts import EVALUATION_SEED, LENGTHS, H, SolvableEnv, make_actor, make_config
 from tests.toy_env import ACTION_DIM
 from warmprior import (
@@ -52,7 +51,7 @@ class Counted(ImageEncoder):
 
 
 @pytest.fixture
-def policy() -> WarmPriorActor:
+def policy():
     torch.manual_seed(0)
     Counted.calls.clear()
     encoder = Counted(["cam"], STATE, image_size=SIZE, crop_size=8, backbone="small")
@@ -60,12 +59,10 @@ def policy() -> WarmPriorActor:
     return WarmPriorActor(PreconditionedNetwork(network), PastPrior(H), nfe=2, clip=1.0)
 
 
-def environment(policy: WarmPriorActor, seed: int = 0) -> TransformedEnv:
-    bases = [CameraEnv(length) for length in LENGTHS]
-    inner = SerialEnv(2, [lambda base=base: base for base in bases])
+def environment(policy, seed=0):
     transforms = policy_transforms(policy.prior, observation_steps=1)
-    encode = EncodeObservation(policy)
-    return TransformedEnv(inner, Compose(transforms, encode, PriorAnchor(policy)))
+    inner = SerialEnv(2, [partial(CameraEnv, length) for length in LENGTHS])
+    return TransformedEnv(inner, Compose(transforms, EncodeObservation(policy), PriorAnchor(policy)))
 
 
 def test_features_are_those_of_the_policy_in_evaluation_mode(policy):
@@ -109,5 +106,5 @@ def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
 
 
 def test_a_policy_of_vectors_has_nothing_to_encode():
-    with pytest.raises(ValueError, match="VelocityMLP has no encoder"):
+    with raises(ValueError, "VelocityMLP", "encoder"):
         EncodeObservation(make_actor())

@@ -1,11 +1,8 @@
-"""The replay buffer on disk: what went in comes out, and nothing that was not committed."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.errors import raises
 from warmprior.rl.training import ReplaySegments
 
 
@@ -62,5 +59,5 @@ def test_a_segment_that_is_gone_is_named(tmp_path, damage):
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(ValueError, match=rf"{path.name}, a part of the replay buffer.*restore it"):
+    with raises(ValueError, path.name):
         ReplaySegments(tmp_path, 3).load()

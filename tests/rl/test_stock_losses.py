@@ -1,7 +1,5 @@
 """TorchRL's own losses, unmodified, through the decoder: gradients, discounts of short chunks, frozenness."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
@@ -11,6 +9,7 @@ from torchrl.envs import RenameTransform
 from torchrl.objectives import CrossQLoss, REDQLoss, SACLoss, SoftUpdate, TQCLoss, ValueEstimators
 
 from tests.rl.test_environment import D_O, DELTA, TO, H, make_decoder, make_env
+from tests.states import copied, same
 from tests.toy_env import ACTION_DIM
 from warmprior import PreviewPrior, keys, make_prior_space_actor, make_prior_space_critic
 
@@ -47,7 +46,7 @@ def make_buffer():
 @pytest.mark.parametrize("loss_class", LOSSES)
 def test_training_loop(loss_class, wiring):
     decoder = make_decoder(PRIOR)
-    before = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
+    before = copied(decoder.state_dict())
     actor, loss = make_loss(loss_class)
     if wiring == "policy":
         env, policy = make_env(PRIOR, gamma=GAMMA), TensorDictSequential(actor, decoder)
@@ -73,8 +72,7 @@ def test_training_loop(loss_class, wiring):
     assert all(torch.isfinite(p).all() for p in parameters.values())
     moved = {name for name, p in parameters.items() if not torch.equal(p, start[name])}
     assert {name.split(".")[0] for name in moved} == {name.split(".")[0] for name in parameters}
-    after = decoder.state_dict()
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert same(before, decoder.state_dict())
     assert not any(p.requires_grad for p in decoder.parameters())
 
 

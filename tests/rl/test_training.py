@@ -1,11 +1,8 @@
-"""Training in source space: what is stored, what is counted and what is kept."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 
-from tests.rl.training_parts import ALGORITHMS, H, check_transitions, make_actor, make_training
+from tests.rl.training_parts import ALGORITHMS, H, check_transitions, from_step, make_actor, make_training
+from tests.states import copied, same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.rl import PriorSpaceTraining
 
@@ -17,10 +14,8 @@ class Recorded(PriorSpaceTraining):
 
     def _save(self):
         super()._save()
-        if not hasattr(self, "saves"):
-            self.saves = {}
-        state = {name: value.clone() for name, value in self.agent.state().items()}
-        self.saves[self.steps] = (state, torch.get_rng_state(), len(self.buffer), len(self.curve))
+        now = copied(self.agent.state()), torch.get_rng_state(), len(self.buffer), len(self.curve)
+        self.saves = getattr(self, "saves", {}) | {self.steps: now}
 
 
 @pytest.mark.parametrize("offset", [1.0, 0.25])
@@ -37,16 +32,15 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
     options = {"actor": actor, "warmup_steps": 40}
     training = make_training(tmp_path, **options, environment_steps=40)
-    fresh = {name: value.clone() for name, value in training.agent.state().items()}
+    fresh = copied(training.agent.state())
     training.run()
-    assert all(torch.equal(fresh[name], value) for name, value in training.agent.state().items())
+    assert same(fresh, training.agent.state())
     assert training.buffer[:]["prior", "delta"].std() == pytest.approx(0.01, rel=0.15)
     more = make_training(tmp_path / "more", **options, environment_steps=70)
     more.run()
     after = more.buffer[:]["prior", "delta"][len(training.buffer) :]
     assert after.std() > 0.1  # an agent's, on its way
-    state = more.agent.state()
-    assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
+    assert not same(fresh, more.agent.state())
 
 
 @pytest.mark.parametrize(
@@ -60,14 +54,11 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
 )
 def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior, see_history):
     actor = make_actor(prior, see_history=see_history)
-    before = {name: value.clone() for name, value in actor.state_dict().items()}
+    before = copied(actor.state_dict())
     training = make_training(tmp_path, actor, algorithm=algorithm)
-    decoder = {name: value.clone() for name, value in training.decoder.state_dict().items()}
-    agent = {name: value.clone() for name, value in training.agent.state().items()}
+    decoder, agent = copied(training.decoder.state_dict()), copied(training.agent.state())
     curve = training.run()
-    for module, old in ((actor, before), (training.decoder, decoder)):
-        new = module.state_dict()
-        assert new.keys() == old.keys() and all(torch.equal(new[n], old[n]) for n in new)
+    assert same(before, actor.state_dict()) and same(decoder, training.decoder.state_dict())
     assert not any("decoder" in name for name in agent)
     moved = {
         name.split("/")[1].split(".")[0]
@@ -112,46 +103,33 @@ def test_the_targets_of_sac_by_hand(tmp_path):
     # The rest is the variance of the single draw per transition.
     variance = 0.7**2 * entropy.sum((1, 2)).var() * follows.square()
     expected = (errors + variance).mean().item()
-    found = sum(loss(data.clone())["loss_qvalue"].item() for _ in range(300)) / 300
+    found = loss(data.repeat(300))["loss_qvalue"].item()
     assert found == pytest.approx(2 * expected, rel=0.02)  # summed over two critics
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_evaluations_leave_the_training_alone(tmp_path, algorithm):
     runs = []
-    for k, options in enumerate(
-        ({"evaluation_episodes": 1}, {"evaluation_episodes": 3}, {"evaluate_every": 40})
-    ):
-        training = make_training(tmp_path / str(k), algorithm=algorithm, **options)
+    schedules = ({"evaluation_episodes": 1}, {"evaluation_episodes": 3}, {"evaluate_every": 40})
+    for k, options in enumerate(schedules):
+        training = make_training(tmp_path / str(k), algorithm=algorithm, environment_steps=60, **options)
         training.run()
         runs.append((training.buffer[:], training.agent.state()))
     (data, state), *others = runs
     for other_data, other_state in others:
         # Another evaluation schedule is another recipe, but the same numbers.
         assert (data == other_data).all()
-        assert all(torch.equal(state[name], other_state[name]) for name in state)
+        assert same(state, other_state)
 
 
 def test_one_seed_gives_one_result_and_another_another(tmp_path):
     runs = []
     for k, seed in enumerate((4, 4, 5)):
-        training = make_training(tmp_path / str(k), seed=seed)
+        training = make_training(tmp_path / str(k), seed=seed, environment_steps=60)
         runs.append((training.run(), training.buffer[:]))
     assert runs[0][0] == runs[1][0] and (runs[0][1] == runs[1][1]).all()
     delta = ("prior", "delta")
     assert not torch.isclose(runs[0][1][delta][:10], runs[2][1][delta][:10]).all()
-
-
-def interrupt_after(steps):
-    """A hook that lets the training die in its ``steps``-th control step."""
-    count = iter(range(1, 10_000))
-
-    def hook(out):
-        if next(count) > steps:
-            raise KeyboardInterrupt
-        return out
-
-    return hook
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -160,19 +138,20 @@ def test_resume(tmp_path, algorithm):
     curve = whole.run()
     at = sorted(whole.saves)
     assert len(at) == 4  # at the start, and after 30, 60 and 90 control steps
-    hook = interrupt_after(at[2] + 7)
     folder = tmp_path / "cut"
+
+    def die(out):
+        raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        make_training(folder, env={"hook": hook}, algorithm=algorithm).run()
+        make_training(folder, env={"hook": from_step(at[2] + 8, die)}, algorithm=algorithm).run()
 
     again = make_training(folder, training_class=Recorded, algorithm=algorithm)
     state, rng, size, evaluations = whole.saves[at[2]]
     assert torch.equal(torch.get_rng_state(), rng)
     assert again.steps == at[2] and again.curve == curve[:evaluations]
     assert (again.buffer[:] == whole.buffer[:][:size]).all()
-    restored = again.agent.state()
-    assert restored.keys() == state.keys()
-    assert all(torch.equal(restored[name], state[name]) for name in state)
+    assert same(again.agent.state(), state)
 
     final = again.run()
     assert [row["evaluation"] for row in final] == [row["evaluation"] for row in curve]

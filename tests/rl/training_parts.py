@@ -1,7 +1,5 @@
 """A tiny training in source space, on an environment whose transitions are known in closed form."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest
@@ -9,16 +7,8 @@ import torch
 from torchrl.data import Categorical
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from tests.toy_env import ACTION_DIM, CountingEnv
-from warmprior import (
-    HistoryObservation,
-    PastPrior,
-    PriorAnchor,
-    VelocityMLP,
-    WarmPriorActor,
-    keys,
-    policy_transforms,
-)
+from tests.toy_env import ACTION_DIM, CountingEnv, mlp_actor
+from warmprior import HistoryObservation, PastPrior, PriorAnchor, keys, policy_transforms
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
 H = 3
@@ -47,11 +37,9 @@ class SolvableEnv(CountingEnv):
 
 def make_actor(prior=None, seed=0, action_dim=ACTION_DIM, see_history=False):
     prior = PastPrior(H) if prior is None else prior
-    torch.manual_seed(seed)
-    observation_dim = 2 + ACTION_DIM + see_history * HistoryObservation.width(H, action_dim)
-    network = VelocityMLP(action_dim, observation_dim, prior.prediction_length, 1, hidden_dim=8)
+    width = 2 + ACTION_DIM + see_history * HistoryObservation.width(H, action_dim)
     key = keys.CONDITIONED if see_history else keys.OBSERVATION
-    return WarmPriorActor(network, prior, nfe=2, clip=1.0, observation_key=key)
+    return mlp_actor(prior, action_dim, width, 1, seed=seed, nfe=2, clip=1.0, observation_key=key)
 
 
 def make_env(seed, actor=None, truncate=True, hook=None, device="cpu", **chunking):
@@ -67,20 +55,22 @@ def make_env(seed, actor=None, truncate=True, hook=None, device="cpu", **chunkin
     return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
 
 
+def from_step(step, act):
+    """A hook that lets ``act`` change what this control step and all later ones return."""
+    count = iter(range(1, 10_000))
+
+    def hook(out):
+        if next(count) >= step:
+            act(out)
+        return out
+
+    return hook
+
+
 def make_config(**options):
-    values = {
-        "environment_steps": 90,
-        "warmup_steps": 30,
-        "nfe": 2,
-        "updates": 1,
-        "noise_critic_steps": 1,
-        "batch_size": 8,
-        "hidden_dim": 8,
-        "num_layers": 1,
-        "evaluate_every": 30,
-        "evaluation_episodes": 2,
-    }
-    return PriorSpaceConfig(**values | options)
+    steps = {"environment_steps": 90, "warmup_steps": 30, "evaluate_every": 30, "evaluation_episodes": 2}
+    sizes = {"batch_size": 8, "hidden_dim": 8, "num_layers": 1, "nfe": 2}
+    return PriorSpaceConfig(**steps | sizes | {"updates": 1, "noise_critic_steps": 1} | options)
 
 
 def hand_rollout(decisions, lengths):
@@ -104,7 +94,7 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0):
     stored = training.buffer[:]
     expected = hand_rollout(len(stored) // len(lengths), lengths)
     assert len(stored) == len(expected)
-    latest: dict[int, tuple[bool, torch.Tensor]] = {}
+    latest = {}
     for row, (i, start, executed, reward, ended) in zip(stored, expected, strict=True):
         following = row["next"]
         assert row["observation"][0, 0] == start
@@ -115,9 +105,8 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0):
         torch.testing.assert_close(following["observation"][0, 2:], last_action)
         assert following["executed_steps"] == executed
         assert float(following["reward"]) == pytest.approx(reward - offset * executed)
-        assert following["done"] == ended
         # DSRL takes time-outs for terminations.
-        assert following["terminated"] == ended
+        assert following["done"] == following["terminated"] == ended
         # The mean of WP-Past is what was executed last.
         if executed == H:
             assert torch.equal(following["prior", "anchor"], row["vla_action", "chunk"])
@@ -135,13 +124,7 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0):
 def make_training(
     directory, actor=None, env=None, training_class=PriorSpaceTraining, collection=None, **options
 ):
-    env = {} if env is None else env
     actor = make_actor() if actor is None else actor
-    return training_class(
-        actor,
-        partial(make_env, **{"actor": actor} | env),
-        make_config(**options),
-        directory,
-        evaluation_seed=EVALUATION_SEED,
-        **({} if collection is None else collection),
-    )
+    environments = partial(make_env, **{"actor": actor} | (env or {}))
+    seeds = {"evaluation_seed": EVALUATION_SEED} | (collection or {})
+    return training_class(actor, environments, make_config(**options), directory, **seeds)
