@@ -1,7 +1,5 @@
 """A policy beside a control loop: against the same in simulation, on a fake clock, and in a real thread."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import threading
@@ -15,7 +13,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from tests.toy_env import ACTION_DIM, CountingEnv, Momentum, window_histories
+from tests.errors import raises
+from tests.toy_env import ACTION_DIM, CountingEnv, Momentum, mlp_actor, stirred, window_histories
 from warmprior import (
     GaussianPrior,
     HistoryObservation,
@@ -23,8 +22,6 @@ from warmprior import (
     PastPrior,
     PreviewPrior,
     RealTimeChunking,
-    VelocityMLP,
-    WarmPriorActor,
     keys,
     policy_transforms,
 )
@@ -35,36 +32,25 @@ OBSERVATION_DIM = 2 + ACTION_DIM
 
 
 def actor(prior, width=0, **options):
-    torch.manual_seed(0)
-    network = VelocityMLP(ACTION_DIM, OBSERVATION_DIM + width, prior.prediction_length, hidden_dim=16)
-    with torch.no_grad():  # its head starts at zero
-        for parameter in network.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    generator = torch.Generator().manual_seed(5)
-    return WarmPriorActor(network, prior, nfe=3, clip=1.0, generator=generator, **options)
+    options |= {"observation_dim": OBSERVATION_DIM + width, "generator": torch.Generator().manual_seed(5)}
+    return stirred(mlp_actor(prior, hidden_dim=16, nfe=3, clip=1.0, **options))
 
 
 @pytest.mark.parametrize(("execute", "latency"), [(4, 0), (4, 2), (5, 1), (3, 3)])
 @pytest.mark.parametrize("prior", [GaussianPrior(6), PastPrior(6), PreviewPrior(6)], ids=str)
 def test_a_simulated_latency_is_that_of_the_environment(prior, execute, latency):
     """Closed loop: the observations hold the last action, and the policy draws at every decision."""
-    length = 23
-    env = TransformedEnv(CountingEnv(length), policy_transforms(prior, execute=execute, delay=latency))
+    env = TransformedEnv(CountingEnv(23), policy_transforms(prior, execute=execute, delay=latency))
+    policies = [actor(prior, guidance=RealTimeChunking()) for _ in range(2)]
     with torch.no_grad():
-        rollout = env.rollout(99, actor(prior, guidance=RealTimeChunking()))
-    expected = executed_actions(rollout)[0]
-    robot = CountingEnv(length)
-    found = []
-    with AsyncExecutor(
-        actor(prior, guidance=RealTimeChunking()), execute=execute, latency=latency
-    ) as executor:
+        expected = executed_actions(env.rollout(99, policies[0]))[0]
+    robot, found = CountingEnv(23), []
+    with AsyncExecutor(policies[1], execute=execute, latency=latency) as executor:
         for _ in range(2):
-            data, done = robot.reset(), False
-            actions = []
-            while not done:
+            data, actions = robot.reset(), []
+            while not data["done"]:
                 actions.append(executor.act(data["observation"]))
                 data = robot.step(data.set("action", actions[-1]))["next"]
-                done = bool(data["done"])
             found.append(torch.stack(actions))
             executor.reset()
         assert set(executor.delays) == {latency}
@@ -87,6 +73,11 @@ class Scripted(TensorDictModuleBase):
         return data.set(self.out_keys[0], torch.cat([step.expand_as(target), target], -1))
 
 
+def running(policy, prior, **options):
+    """An executor of a scripted policy that sees one observation."""
+    return AsyncExecutor(policy, prior=prior, action_dim=2, **{"observation_steps": 1} | options)
+
+
 class FakeClock(Executor):
     """Computations that end so many ticks after they were begun; the first one ends at once."""
 
@@ -107,8 +98,12 @@ class FakeClock(Executor):
         for job in [job for job in self.running if job[0] <= self.tick]:
             self.running.remove(job)
             _, future, fn, args = job
-            if not future.cancelled():
+            if future.cancelled():
+                continue
+            try:
                 future.set_result(fn(*args))
+            except Exception as error:
+                future.set_exception(error)
 
 
 def drive(executor, clock, ticks):
@@ -123,16 +118,7 @@ def test_measured_delays_on_a_fake_clock():
     """P = 12, H = 6: decisions every 4 steps, or as soon as the last one took effect."""
     durations = [2, 1, 5, 1, 1, 1, 1]
     clock, policy = FakeClock(durations), Scripted(12)
-    executor = AsyncExecutor(
-        policy,
-        prior=PreviewPrior(6),
-        action_dim=2,
-        execute=4,
-        delay=1,
-        window=3,
-        observation_steps=1,
-        pool=clock,
-    )
+    executor = running(policy, PreviewPrior(6), execute=4, delay=1, window=3, pool=clock)
     actions = drive(executor, clock, 31)
     # Every action is the one for the step at which it is executed, whoever is late.
     assert actions[:, 1].tolist() == [float(i) for i in range(31)]
@@ -161,17 +147,19 @@ def test_a_users_prior_has_the_mean_of_its_training_windows():
         for tick in range(frames):
             actions.append(executor.act(torch.full((OBSERVATION_DIM,), tick / frames)))
     source = prior.distribution(window_histories(torch.stack(actions), torch.arange(frames), 4))
-    loc, warm = source.loc, source.warm
-    assert len(found) == frames and warm[:, 0, 0].tolist() == [False] * 2 + [True] * (frames - 2)
-    assert torch.equal(torch.stack([data["prior", "loc"] for data in found]), loc)
-    assert torch.equal(torch.stack([data["prior", "warm"] for data in found]), warm)
+    assert len(found) == frames and source.warm[:, 0, 0].tolist() == [False] * 2 + [True] * (frames - 2)
+    for name in ("loc", "warm"):
+        assert torch.equal(torch.stack([data["prior", name] for data in found]), getattr(source, name))
+
+
+def recorded():
+    data = {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2) + 9}
+    return TensorDict(data, [20])
 
 
 def test_several_entries_raw_units_and_last_actions_that_networks_see():
     """An observation of entries; raw units on the robot's side; a network that sees the last actions."""
-    raw = TensorDict(
-        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2)}, [20]
-    )
+    raw = recorded()
     normalizer = Normalizer.fit(raw)
     prior, width = GaussianPrior(4), HistoryObservation.width(4, ACTION_DIM)
     inside, outside = (
@@ -192,12 +180,9 @@ def test_several_entries_raw_units_and_last_actions_that_networks_see():
             flat = data.clone().set("observation", data["observation", "state"])
             return data.set(self.out_keys[0], super().forward(flat)[self.out_keys[0]])
 
-    executor = AsyncExecutor(Nested(6), prior=GaussianPrior(6), action_dim=2, execute=3, latency=1)
+    executor = running(Nested(6), GaussianPrior(6), execute=3, latency=1, observation_steps=2)
     seen = TensorDict({"state": torch.tensor([7.0]), "image": torch.zeros(3, 4, 4).byte()})
     assert executor.act(seen).tolist() == [7.0, 7.0]
-
-
-# ------------------------------------------------------------------------------------------ a real thread
 
 
 class Slow(Scripted):
@@ -216,15 +201,13 @@ class Slow(Scripted):
 
 def test_a_slow_policy_does_not_hold_the_loop_up():
     policy = Slow(8)
-    executor = AsyncExecutor(
-        policy, prior=PastPrior(8), action_dim=2, execute=5, observation_steps=1, timeout=0.05
-    )
+    executor = running(policy, PastPrior(8), execute=5, timeout=0.05)
     started = time.monotonic()
     for tick in range(8):  # decided at 5; three more steps are left of the first chunk
         assert executor.act(torch.tensor([float(tick)])).tolist() == [0.0, tick]
     assert time.monotonic() - started < 5  # it waited for nothing but the first chunk
     for _ in range(2):
-        with pytest.raises(TimeoutError, match=r"after 3 control steps and 0\.05 s.*Hold the robot"):
+        with raises(TimeoutError, 3, "0.05"):
             executor.act(torch.tensor([8.0]))
     assert executor.delays == ()
     policy.leave.set()
@@ -234,13 +217,11 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
     assert policy.threads[0] is policy.threads[1] is not threading.current_thread()
     executor.close()
     assert not policy.threads[0].is_alive()
-    with pytest.raises(RuntimeError, match="closed"):
+    with raises(RuntimeError, "closed"):
         executor.act(torch.zeros(1))
 
 
 class Failing(Scripted):
-    """Raises at the decisions whose numbers are named."""
-
     def __init__(self, length, fails):
         super().__init__(length)
         self.fails, self.decisions = fails, 0
@@ -254,13 +235,12 @@ class Failing(Scripted):
 
 def failing(fails, latency):
     policy = Failing(8, fails)
-    options = {"prior": GaussianPrior(8), "action_dim": 2, "execute": 4, "observation_steps": 1}
-    return policy, AsyncExecutor(policy, **options, timeout=30.0, latency=latency)
+    return policy, running(policy, GaussianPrior(8), execute=4, timeout=30.0, latency=latency)
 
 
 def test_a_decision_that_fails_is_tried_again_while_actions_are_left():
     policy, executor = failing({1, 2}, latency=1)
-    with pytest.warns(UserWarning, match=r"decision failed.*camera.*the 4 actions that are left"):
+    with pytest.warns(UserWarning, match=r"camera.*\b4 actions"):
         found = [executor.act(torch.tensor([float(tick)])) for tick in range(12)]
     # Which decision an action is of, and for which step: those of the steps 4 and 5 failed.
     assert [action[1].item() for action in found] == list(range(12))
@@ -279,7 +259,7 @@ def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
         for tick in range(8):
             assert executor.act(torch.tensor([float(tick)]))[1] == tick
         for _ in range(3):
-            with pytest.raises(ZeroDivisionError, match="camera"):
+            with raises(ZeroDivisionError, "camera"):
                 executor.act(torch.tensor([8.0]))
         policy.fails = ()
         while True:  # in a thread, the last call may still have failed
@@ -290,9 +270,7 @@ def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
 
 def test_a_reset_forgets_what_is_under_way():
     policy = Slow(8)
-    with AsyncExecutor(
-        policy, prior=GaussianPrior(8), action_dim=2, execute=4, observation_steps=1
-    ) as executor:
+    with running(policy, GaussianPrior(8), execute=4) as executor:
         for tick in range(6):
             executor.act(torch.tensor([float(tick)]))
         executor.reset()
@@ -321,28 +299,29 @@ def test_chunks_that_no_robot_should_get():
         def forward(self, data):
             return data.set(self.out_keys[0], torch.full((self.length, 2), torch.nan))
 
-    usual = {"prior": GaussianPrior(8), "action_dim": 2, "execute": 4, "latency": 1}
-    with pytest.raises(FloatingPointError, match="NaN"):
-        AsyncExecutor(Wrong(8), **usual).act(torch.zeros(1))
-    with pytest.raises(ValueError, match=r"chunk has shape \[7, 2\], expected \[8, 2\]"):
-        AsyncExecutor(Scripted(7), **usual).act(torch.zeros(1))
+    for policy, error, fact in ((Wrong(8), FloatingPointError, "NaN"), (Scripted(7), ValueError, "[7, 2]")):
+        with raises(error, fact):
+            running(policy, GaussianPrior(8), execute=4, latency=1).act(torch.zeros(1))
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "facts"),
     [
-        ({"execute": 6, "delay": 3}, r"8 actions.*6.*delay of 3.*at most 5"),
-        ({"latency": 5}, r"delay of 5.*too long for predictions of 8 actions.*at most 4"),
-        ({"latency": 1.5}, "delay must be a whole number"),
-        ({"execute": 2.5}, "execute must be a whole number of at least 1, got 2.5"),
-        ({"latency": 1, "pool": FakeClock([])}, "leave out pool"),
-        ({"prior": None}, "Scripted needs prior and action_dim"),
+        *(({"execute": 6, "delay": 3}, (8, 6, 3, 5)), ({"latency": 5}, (5, 8, 4))),
+        *(({"latency": 1.5}, ("delay", 1.5)), ({"execute": 2.5}, ("execute", 2.5))),
+        ({"latency": 1, "pool": FakeClock([])}, ("pool",)),
+        ({"prior": None}, ("Scripted", "prior", "action_dim")),
+        *(
+            ({"delay": 0.06}, (0.06, "control_rate")),
+            ({"delay": float("nan"), "control_rate": 20}, ("delay",)),
+        ),
+        ({"delay": 0.06, "control_rate": 0}, ("control_rate", 0)),
+        ({"delay": 1.0, "control_rate": 50}, ("delay", 50)),
     ],
 )
-def test_options_that_cannot_be(options, said):
-    usual = {"prior": GaussianPrior(8), "action_dim": 2}
-    with pytest.raises(ValueError, match=said):
-        AsyncExecutor(Scripted(8), **(usual | options))
+def test_options_that_cannot_be(options, facts):
+    with raises(ValueError, *facts):
+        running(Scripted(8), **{"prior": GaussianPrior(8)} | options)
     assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]
 
 
@@ -354,10 +333,9 @@ def test_a_decision_that_fails_while_the_loop_waits():
             time.sleep(0.05 if self.decisions else 0.0)
             return super().forward(data)
 
-    options = {"prior": PreviewPrior(4), "action_dim": 2, "execute": 2, "observation_steps": 1}
-    with AsyncExecutor(Late(8, {1}), **options, timeout=None) as executor:
+    with running(Late(8, {1}), PreviewPrior(4), execute=2, timeout=None) as executor:
         found = [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(8)]
-        with pytest.raises(ZeroDivisionError, match="camera"):
+        with raises(ZeroDivisionError, "camera"):
             executor.act(torch.tensor([8.0]))
         found += [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(8, 12)]
     assert found == list(range(12))
@@ -393,27 +371,12 @@ class RandomClock(FakeClock):
         self.running.append((self.tick + duration, future, fn, run))
         return future
 
-    def advance(self):
-        self.tick += 1
-        for job in [job for job in self.running if job[0] <= self.tick]:
-            self.running.remove(job)
-            _, future, fn, args = job
-            if future.cancelled():
-                continue
-            try:
-                future.set_result(fn(*args))
-            except Exception as error:
-                future.set_exception(error)
-
 
 class Longer(PreviewPrior):
     """Remembers more than it predicts."""
 
     name = "longer-for-executors"
     history_length = 17
-
-    def __init__(self, chunk_length):
-        super().__init__(chunk_length)
 
 
 CALLS = 50_000
@@ -429,7 +392,7 @@ def test_fifty_thousand_calls(prior):
     """
     length, remembered = prior.prediction_length, prior.history_length
     policy, clock = Scripted(length), RandomClock(length, seed=0)
-    executor = AsyncExecutor(policy, prior=prior, action_dim=2, execute=5, observation_steps=1, pool=clock)
+    executor = running(policy, prior, execute=5, pool=clock)
     done, errors, held, calls = [], 0, 0, 0
     while calls < CALLS:
         calls += 1
@@ -464,10 +427,7 @@ def test_decisions_that_take_longer_than_what_is_remembered():
     for timeout in (None, 0.0):
         clock = RandomClock(8, seed=0)
         clock.random = type("Always", (), {"random": lambda self: 0.5, "randint": lambda self, *ends: 6})()
-        executor = AsyncExecutor(
-            Scripted(8), prior=PreviewPrior(4), action_dim=2, observation_steps=1, timeout=timeout, pool=clock
-        )
-        found = []
+        executor, found = running(Scripted(8), PreviewPrior(4), timeout=timeout, pool=clock), []
         while len(found) < 60:
             try:
                 found.append(executor.act(torch.tensor([float(len(found))]))[1].item())
@@ -478,10 +438,8 @@ def test_decisions_that_take_longer_than_what_is_remembered():
 
 
 def test_several_threads_take_turns():
-    policy, found = Scripted(8), []
-    with AsyncExecutor(
-        policy, prior=PreviewPrior(4), action_dim=2, execute=3, observation_steps=1, timeout=None
-    ) as executor:
+    found = []
+    with running(Scripted(8), PreviewPrior(4), execute=3, timeout=None) as executor:
 
         def loop():
             for _ in range(100):
@@ -494,15 +452,11 @@ def test_several_threads_take_turns():
             thread.start()
         for thread in threads:
             thread.join(60)
-    assert len(found) == 400
-    steps = executor._history["steps"]
-    assert int(steps) == 4
+    assert len(found) == 400 and int(executor._history["steps"]) == 4
 
 
 def test_the_policys_own_normaliser():
-    raw = TensorDict(
-        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2) + 9}, [20]
-    )
+    raw = recorded()
     normalizer = Normalizer.fit(raw)
     own, given = (
         AsyncExecutor(actor(PastPrior(4), **options), execute=3, latency=1, normalizer=n)
@@ -513,7 +467,7 @@ def test_the_policys_own_normaliser():
         assert torch.equal(action, given.act(row["observation"])) and action.min() > 5
     plain = actor(PastPrior(4), normalizer=normalizer).replace(normalizer=None)
     assert AsyncExecutor(plain, latency=0).act(raw[0]["observation"]).abs().max() <= 1
-    with pytest.raises(ValueError, match="no 'action'"):
+    with raises(ValueError, "'action'"):
         AsyncExecutor(plain, latency=0, normalizer=Normalizer.fit(raw, ("observation",)))
 
 
@@ -530,9 +484,6 @@ def test_a_delay_behind_what_is_guided():
     assert 4 in executor.delays
 
 
-# ---------------------------------------------------------------------------------- a robot's observations
-
-
 @pytest.mark.parametrize(
     ("delay", "rate", "steps"), [(None, None, 1), (3, None, 3), (0.06, 50, 3), (0.061, 50, 4), (0.0, 20, 0)]
 )
@@ -541,17 +492,3 @@ def test_delays_in_steps_or_seconds(delay, rate, steps):
     assert executor.expected_delay == steps
     past = AsyncExecutor(actor(PastPrior(8)), delay=delay, control_rate=rate)
     assert past.execute == 8 - steps  # what the prediction leaves
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"delay": 0.06}, r"0\.06.*control_rate"),
-        ({"delay": 0.06, "control_rate": 0}, "control_rate"),
-        ({"delay": float("nan"), "control_rate": 20}, "delay"),
-        ({"delay": 1.0, "control_rate": 50}, "50 control steps"),
-    ],
-)
-def test_delays_that_cannot_be(options, said):
-    with pytest.raises(ValueError, match=said):
-        AsyncExecutor(actor(PreviewPrior(8)), **options)

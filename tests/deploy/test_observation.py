@@ -1,14 +1,13 @@
 """What a robot's drivers return reaches the policy as its training had it, or is refused by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.deploy.test_executor import OBSERVATION_DIM, Scripted, actor
-from tests.toy_env import ACTION_DIM
+from tests.errors import raises
+from tests.toy_env import ACTION_DIM, stirred
 from warmprior import ImageEncoder, Normalizer, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.deploy import AsyncExecutor
 
@@ -19,15 +18,9 @@ def sighted(**options):
     """A policy of two cameras of 16 x 16 pixels, whose central 12 x 12 it sees, and a state of 3."""
     torch.manual_seed(0)
     encoder = ImageEncoder(CAMERAS, 3, image_size=16, crop_size=12, backbone="small")
-    velocity = VelocityMLP(ACTION_DIM, encoder.observation_dim, 6, hidden_dim=16)
-    with torch.no_grad():
-        for parameter in velocity.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    bounds = ("observation", "state"), "action"
-    normalizer = Normalizer(
-        {key: torch.full((n,), -3.0) for key, n in zip(bounds, (3, ACTION_DIM), strict=True)},
-        {key: torch.full((n,), 5.0) for key, n in zip(bounds, (3, ACTION_DIM), strict=True)},
-    )
+    velocity = stirred(VelocityMLP(ACTION_DIM, encoder.observation_dim, 6, hidden_dim=16))
+    ones = {("observation", "state"): torch.ones(3), "action": torch.ones(ACTION_DIM)}
+    normalizer = Normalizer(*({key: bound * one for key, one in ones.items()} for bound in (-3.0, 5.0)))
     generator = torch.Generator().manual_seed(5)
     network = VisionNetwork(encoder, velocity)
     return WarmPriorActor(network, PastPrior(6), nfe=2, normalizer=normalizer, generator=generator, **options)
@@ -88,11 +81,7 @@ def test_images_in_every_form_are_equal():
     [
         ({"wrist_image": None}, KeyError, ["wrist_image"]),
         ({"state": np.zeros(4)}, ValueError, ["state", "[4]", "[3]"]),
-        (
-            {"front_image": np.zeros((16, 16, 3))},
-            ValueError,
-            ["front_image", "[16, 16, 3]", "float64", "uint8"],
-        ),
+        ({"front_image": np.zeros((16, 16, 3))}, ValueError, ["front_image", "float64", "uint8"]),
         ({"front_image": np.zeros((16, 16), np.uint8)}, ValueError, ["front_image", "[16, 16]"]),
         ({"front_image": np.zeros((16, 16, 4), np.uint8)}, ValueError, ["front_image", "[16, 16, 4]"]),
         ({"front_image": np.zeros((0, 16, 3), np.uint8)}, ValueError, ["front_image", "[0, 16, 3]"]),
@@ -103,25 +92,23 @@ def test_what_is_no_observation_is_refused_and_changes_nothing(change, kind, sai
     usual = {"state": np.zeros(3), **pictures(20, 20)}
     with AsyncExecutor(sighted(), latency=0) as executor, AsyncExecutor(sighted(), latency=0) as other:
         for _ in range(8):
-            with pytest.raises(kind) as refused:
+            with raises(kind, *said) as refused:
                 executor.act(usual | change)
-            assert all(word in str(refused.value) for word in said) and "\n" not in str(refused.value)
+            assert "\n" not in str(refused.value)
             assert torch.equal(executor.act(usual), other.act(usual))
-        with pytest.raises(ValueError, match="front_image"):
+        with raises(ValueError, "front_image"):
             executor.act(np.zeros(3))
 
 
 def test_a_vector_may_be_the_state_among_others():
-    usual = {"latency": 0}
-    one, two = AsyncExecutor(actor(PastPrior(6)), **usual), AsyncExecutor(actor(PastPrior(6)), **usual)
+    one, two = (AsyncExecutor(actor(PastPrior(6)), latency=0) for _ in range(2))
     seen = np.linspace(-1, 1, OBSERVATION_DIM)
     for _ in range(8):
-        assert torch.equal(
-            one.act({"state": seen, "front_image": pictures(8, 8)}), two.act(torch.tensor(seen))
-        )
-    with pytest.raises(ValueError, match=rf"\[1\].*\[{OBSERVATION_DIM}\]"):  # it would be broadcast
+        action = one.act({"state": seen, "front_image": pictures(8, 8)})
+        assert torch.equal(action, two.act(torch.tensor(seen)))
+    with raises(ValueError, "[1]", [OBSERVATION_DIM]):  # it would be broadcast
         one.act(torch.zeros(1))
-    with pytest.raises(KeyError, match=r"state.*front_image"):
+    with raises(KeyError, "state", "front_image"):
         one.act({"front_image": pictures(8, 8)})
 
 

@@ -1,7 +1,5 @@
 """A package with the interface of MimicGen's: written for robosuite 1.4, registered when imported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 TOP = """

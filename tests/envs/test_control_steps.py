@@ -1,14 +1,9 @@
 """Control steps in one go are those taken one by one, bit by bit."""
 
-from __future__ import annotations
-
-import importlib.util
-
 import pytest
 import torch
 
-if not importlib.util.find_spec("robosuite"):
-    pytest.skip("needs robosuite", allow_module_level=True)
+pytest.importorskip("robosuite")
 
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
@@ -80,8 +75,7 @@ def test_an_episode_ends_on_the_way(monkeypatch, end):
 
     monkeypatch.setattr(simulator, "_check_success", solved)
     expected = one_by_one(env, actions)
-    assert len(expected) == end
-    assert expected[-1]["terminated"]
+    assert len(expected) == end and expected[-1]["terminated"]
     env.set_seed(0)
     env.reset()
     check(env.control_steps(actions, keep=3), expected, keep=3)
@@ -107,7 +101,6 @@ def test_chunks(steps, last):
             data = env.step(data.set(("vla_action", "chunk"), chunk))
             rows.append(data["next"])
             data = env.step_mdp(data)
-        assert rows[-1]["truncated"]
-        assert rows[-1]["executed_steps"] == last
+        assert rows[-1]["truncated"] and rows[-1]["executed_steps"] == last
         found.append(torch.stack(rows))
     assert (found[0] == found[1]).all()

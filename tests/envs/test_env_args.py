@@ -1,6 +1,5 @@
-from __future__ import annotations
-
 import copy
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -11,11 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from tests.data.synthetic import env_args_14, env_args_15
-from warmprior.envs.env_args import (
-    absolute_actions,
-    delta_conventions,
-    modernize_env_args,
-)
+from tests.errors import raises
+from warmprior.envs.env_args import absolute_actions, delta_conventions, modernize_env_args
 from warmprior.rotation import (
     matrix_to_rotation_6d,
     matrix_to_rotvec,
@@ -34,7 +30,6 @@ def _quaternions(n, seed=0):
     return Rotation.random(n, random_state=seed).as_quat()
 
 
-# ---------------------------------------------------------------------------- rotations
 @settings(deadline=None, max_examples=200)
 @given(arrays(np.float64, (3,), elements=finite))
 def test_rotvec_round_trip_against_scipy(rotvec):
@@ -56,7 +51,6 @@ def test_quaternions_against_scipy():
     np.testing.assert_allclose(quaternion_to_matrix(torch.from_numpy(-3 * quaternions)), expected, atol=1e-12)
 
 
-# ---------------------------------------------------------------------------- absolute actions
 def _reference(actions, position, quaternion, base=None):
     """One arm, with scipy: [N, 7] deltas to positions, rotations and grippers."""
     base = base or Rotation.identity()
@@ -75,18 +69,13 @@ def test_absolute_actions_against_scipy(arms):
     quaternion = np.concatenate([_quaternions(n, seed) for seed in range(arms)], -1)
     out = absolute_actions(*map(torch.from_numpy, (actions, position, quaternion)))
     assert out.shape == (n, 10 * arms)
-    for arm in range(arms):
-        goal, rotation, gripper = _reference(
-            actions[:, 7 * arm : 7 * arm + 7],
-            position[:, 3 * arm : 3 * arm + 3],
-            quaternion[:, 4 * arm : 4 * arm + 4],
-        )
+    of_arms = (np.split(values, arms, -1) for values in (out.numpy(), actions, position, quaternion))
+    for found, *parts in zip(*of_arms, strict=True):
+        goal, rotation, gripper = _reference(*parts)
         rows = rotation.as_matrix()[:, :2].reshape(n, 6)
-        expected = np.concatenate([goal, rows, gripper], -1)
-        np.testing.assert_allclose(out[:, 10 * arm : 10 * arm + 10], expected, atol=1e-9)
+        np.testing.assert_allclose(found, np.concatenate([goal, rows, gripper], -1), atol=1e-9)
 
 
-# ---------------------------------------------------------------------------- env_args
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("make", [env_args_14, env_args_15])
 def test_modernize_is_pure_and_idempotent(task, make):
@@ -95,6 +84,10 @@ def test_modernize_is_pure_and_idempotent(task, make):
     once = modernize_env_args(before)
     assert before == kept
     assert modernize_env_args(once) == once
+    # Some writers repeat the name among the options, and robosuite would be given it twice.
+    kept["env_kwargs"]["env_name"] = kept["env_name"]
+    assert modernize_env_args(kept) == once
+    del kept["env_kwargs"]["env_name"]
     once["env_kwargs"]["controller_configs"]["body_parts"]["right"]["kp"] = -1
     assert before == kept
 
@@ -113,15 +106,14 @@ def test_modernize_old_description():
 
 def test_delta_conventions_read_the_controller():
     meta = env_args_14("square")
-    meta["env_kwargs"]["controller_configs"] |= {
-        "output_max": [0.1] * 3 + [0.3] * 3,
-        "output_min": [-0.1] * 3 + [-0.3] * 3,
-    }
+    limits = [0.1] * 3 + [0.3] * 3
+    own = {"output_max": limits, "output_min": [-limit for limit in limits]}
+    meta["env_kwargs"]["controller_configs"] |= own
     output_max, base = delta_conventions(meta)
-    assert output_max.tolist() == [0.1] * 3 + [0.3] * 3
+    assert output_max.tolist() == limits
     torch.testing.assert_close(base, torch.eye(3, dtype=torch.float64)[None])
     meta["env_kwargs"]["controller_configs"]["output_min"] = [-0.2] * 6
-    with pytest.raises(ValueError, match="symmetric"):
+    with raises(ValueError, "symmetric"):
         delta_conventions(meta)
 
 
@@ -131,20 +123,14 @@ def test_absolute_goal_is_the_controllers_own_goal(task, frame):
     suite = pytest.importorskip("robosuite")
     meta = env_args_15(task, frame)
     env = suite.make(meta["env_name"], **modernize_env_args(meta)["env_kwargs"])
-    try:
+    with closing(env):
         np.random.seed(0)
-        obs = env.reset()
-        rng = np.random.default_rng(0)
-        action = rng.uniform(-1, 1, env.action_dim)
-        arms = range(len(env.robots))
+        obs, arms = env.reset(), range(len(env.robots))
+        action = np.random.default_rng(0).uniform(-1, 1, env.action_dim)
+        poses = [np.concatenate([obs[f"robot{a}_{key}"] for a in arms]) for key in ("eef_pos", "eef_quat")]
         output_max, base = delta_conventions(meta)
-        goal = absolute_actions(
-            torch.from_numpy(action),
-            torch.from_numpy(np.concatenate([obs[f"robot{a}_eef_pos"] for a in arms])),
-            torch.from_numpy(np.concatenate([obs[f"robot{a}_eef_quat"] for a in arms])),
-            output_max=output_max,
-            base_rotation=base,
-        ).numpy()
+        options = {"output_max": output_max, "base_rotation": base}
+        goal = absolute_actions(*map(torch.from_numpy, (action, *poses)), **options).numpy()
         for arm, robot in enumerate(env.robots):
             part = robot.part_controllers["right"]
             origin = (robot.base_pos, Rotation.from_matrix(part.origin_ori))
@@ -156,5 +142,3 @@ def test_absolute_goal_is_the_controllers_own_goal(task, frame):
             np.testing.assert_allclose(goal[10 * arm : 10 * arm + 3], position, atol=1e-5)
             rows = rotation[:2].reshape(6)
             np.testing.assert_allclose(goal[10 * arm + 3 : 10 * arm + 9], rows, atol=1e-5)
-    finally:
-        env.close()

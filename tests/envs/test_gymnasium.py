@@ -1,7 +1,3 @@
-"""Gymnasium environments: their episodes and infos, against the bare environments."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -7,6 +5,7 @@ import pytest
 import torch
 
 from tests.envs.mimicgen_stub import write_mimicgen
+from tests.errors import raises
 
 pytest.importorskip("robosuite")
 
@@ -72,6 +71,6 @@ def test_another_package_of_the_name_is_refused_without_running_it(path, kind):
         (path / "mimicgen" / "__init__.py").write_text(code)
     else:
         (path / "mimicgen.py").write_text(code)
-    with pytest.raises(ImportError, match=r"is not NVlabs'.*pip uninstall mimicgen.*git clone"):
+    with raises(ImportError, "NVlabs'", "pip uninstall mimicgen", "git clone"):
         RobosuiteEnv("stack_d0")
     assert "mimicgen" not in sys.modules

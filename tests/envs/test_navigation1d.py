@@ -1,7 +1,5 @@
 """The navigation toy: its geometry by dense sampling, its episodes, and its metrics on known paths."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.errors import raises
 from tests.toy_env import ChunkPolicy
 from warmprior import GaussianPrior, PastPrior, policy_transforms, window_replay_buffer
 from warmprior.envs import (
@@ -25,8 +24,9 @@ from warmprior.envs.navigation1d import navigation_collides
 
 @pytest.mark.parametrize("batch_size", [(), (3,), (2, 2)])
 @pytest.mark.parametrize("octaves", [0, 4])
-def test_specs(batch_size, octaves):
-    check_env_specs(NavigationEnv(octaves=octaves, batch_size=batch_size))
+@pytest.mark.parametrize("route", [None, (1, -1)])
+def test_specs(batch_size, octaves, route):
+    check_env_specs(NavigationEnv(route, octaves=octaves, batch_size=batch_size))
 
 
 def test_a_policy_may_see_the_position_alone():
@@ -36,7 +36,7 @@ def test_a_policy_may_see_the_position_alone():
         torch.testing.assert_close(seen, navigation_positions()[:, None])
     for make in NavigationEnv, navigation_demonstrations:
         for octaves in -1, 1.5, True:
-            with pytest.raises(ValueError, match=f"octaves must be a whole number .*, got {octaves}"):
+            with raises(ValueError, "octaves", octaves):
                 make(octaves=octaves)
 
 
@@ -70,21 +70,15 @@ def test_collision_of_a_segment_against_dense_points(x, width, y):
 def heights_policy(heights, chunk):
     """Plays given heights ``[n, 64]`` in chunks."""
     padded = torch.cat([heights, heights[:, -1:].expand(-1, chunk)], 1)
-
-    def act(tensordict):
-        start = tensordict["step_index"]
-        return padded.gather(1, start + torch.arange(chunk)).unsqueeze(-1)
-
-    return ChunkPolicy(act)
+    return ChunkPolicy(lambda data: padded.gather(1, data["step_index"] + torch.arange(chunk)).unsqueeze(-1))
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 5])
 def test_episode_executes_the_heights_and_reports_collisions(chunk):
     torch.manual_seed(0)
     heights = torch.cat([navigation_heights(), torch.zeros(1, 64), 0.6 * torch.randn(5, 64)])
-    env = TransformedEnv(
-        NavigationEnv(batch_size=[12]), policy_transforms(GaussianPrior(chunk), observation_steps=1)
-    )
+    transforms = policy_transforms(GaussianPrior(chunk), observation_steps=1)
+    env = TransformedEnv(NavigationEnv(batch_size=[12]), transforms)
     rollout = env.rollout(1000, heights_policy(heights, chunk))
     assert rollout.shape == (12, math.ceil(64 / chunk))
     last = rollout["next"][:, -1]
@@ -103,10 +97,8 @@ def test_metrics_of_known_paths():
     switching = torch.where(torch.arange(64) // 4 % 2 == 0, above, below)
     crossing = torch.where(torch.arange(64) < 32, above, below)  # between the obstacles
     late = torch.where(torch.arange(64) < 34, above, below)  # the same, inside a chunk
-    one = {
-        name: navigation_metrics(path[None], 4)
-        for name, path in (("a", above), ("s", switching), ("c", crossing), ("l", late))
-    }
+    paths = {"a": above, "s": switching, "c": crossing, "l": late}
+    one = {name: navigation_metrics(path[None], 4) for name, path in paths.items()}
     assert [m.switch_rate for m in one.values()] == pytest.approx([0, 1, 1 / 15, 0])
     assert [m.commit_rate for m in one.values()] == [1, 0, 0, 0]
     assert [m.collision_rate for m in one.values()] == [0, 1, 0, 0]

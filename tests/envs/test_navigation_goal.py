@@ -1,12 +1,7 @@
-"""The toy with a goal: which paths solve it, and when an episode ends."""
-
-from __future__ import annotations
-
 import itertools
 
 import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
 
 from warmprior.envs import NavigationEnv, navigation_heights
 
@@ -39,12 +34,6 @@ def play(env, paths):
         data = following.exclude("reward")
     assert (length > 0).all()
     return rewards, length, solved
-
-
-@pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("batch", [[], [3]])
-def test_specs(route, batch):
-    check_env_specs(NavigationEnv(route, batch_size=batch))
 
 
 @pytest.mark.parametrize("route", ROUTES)

@@ -1,18 +1,19 @@
 """The loop of examples/robot_loop.py, on a clock that moves only where the loop sleeps, and as it stands."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from tests.errors import raises
+from tests.toy_env import mlp_actor
+from warmprior import PastPrior
 from warmprior.deploy import AsyncExecutor
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "robot_loop.py"
@@ -78,8 +79,7 @@ class Arm:
         self.asked.append("stop")
 
 
-def policy():
-    return WarmPriorActor(VelocityMLP(2, 3, 8, hidden_dim=8), PastPrior(8), nfe=1)
+policy = partial(mlp_actor, PastPrior(8), observation_dim=3, nfe=1)
 
 
 def test_an_action_per_period(example, clock):
@@ -117,7 +117,7 @@ def test_a_robot_that_stops_answering_is_held_and_stopped(example, clock, hears)
     arm = Arm(clock, fails=range(10, 999))
     if not hears:
         arm.hold = lambda: arm.asked.append("hold") or arm.observe()
-    with pytest.raises(RuntimeError, match="check its cable") as stopped:
+    with raises(RuntimeError, "check its cable") as stopped:
         example.run(arm, policy(), 50.0, 10.0)
     assert "\n" not in str(stopped.value)
     assert arm.asked[:11] == ["connect", *["act"] * 10]
@@ -136,7 +136,7 @@ def test_a_decision_that_fails_holds_once_no_action_is_left(example, clock):
 
     failing.register_forward_pre_hook(fail)
     arm = Arm(clock)
-    with pytest.warns(UserWarning, match="decision failed"):
+    with pytest.warns(UserWarning, match="camera"):
         record = example.run(arm, failing, 50.0, 0.99)
     assert arm.asked[1:9] == ["act"] * 8  # the whole chunk
     assert record.held and arm.asked[-2:] == ["act", "stop"]
@@ -152,7 +152,7 @@ def test_ctrl_c_stops_the_robot(example, clock, capsys):
 def test_what_the_policy_cannot_see_is_said_before_the_robot_moves(example, clock):
     arm = Arm(clock)
     arm.observe = lambda: {"joints": np.zeros(3)}
-    with pytest.raises(KeyError, match=r"state.*joints"):
+    with raises(KeyError, "state", "joints"):
         example.run(arm, policy(), 50.0, 0.99)
     assert arm.asked == ["connect", "stop"]
 
@@ -168,8 +168,9 @@ def test_demonstrations_are_what_the_arm_shows(example, camera):
     state = observation["state"] if camera else observation
     assert state.shape[1:] == seen["state"].shape
     if camera:
-        assert observation["front_image"].shape[1:] == (3, 32, 32)
-        assert observation["front_image"].dtype == torch.uint8 and seen["front_image"].dtype == np.uint8
+        image = observation["front_image"]
+        assert image.shape[1:] == (3, 32, 32) and image.dtype == torch.uint8
+        assert seen["front_image"].dtype == np.uint8
 
 
 def program(*options):
@@ -188,3 +189,12 @@ def test_the_program_says_why_it_stopped():
     done = program("--unplug", "0.3")
     assert done.returncode == 1
     assert done.stderr.strip().count("\n") == 0 and "has not answered" in done.stderr
+
+
+def test_it_has_the_options_that_its_page_names():
+    page = (SCRIPT.parents[1] / "docs" / "your_robot.md").read_text()
+    (training,) = re.findall(r"python -m warmprior train (.*?)```", page, re.S)
+    named = set(re.findall(r"(?:robot_loop\.py|`)\s*(--[a-z-]+)", page)) - {*training.split()}
+    assert {"--camera", "--unplug"} <= named
+    listed = program("--help").stdout
+    assert all(option in listed for option in named)

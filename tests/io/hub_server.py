@@ -1,7 +1,5 @@
 """A server on the loopback interface that keeps model repositories as the hub does, for its own client."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -15,29 +13,41 @@ TOKEN = "hf_loopback"
 
 
 class Loopback:
-    """A server whose ``answer`` is given every request."""
+    """A server that replies what ``answer`` gives for a request: a status, headers and content."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         hub = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                hub.answer(self)
+            def do_GET(self):
+                body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+                if self.headers.get("Transfer-Encoding") == "chunked":
+                    while size := int(self.rfile.readline(), 16):
+                        body += self.rfile.read(size)
+                        self.rfile.readline()
+                    self.rfile.readline()
+                allowed = self.headers.get("Authorization") == f"Bearer {TOKEN}"
+                path = self.path.partition("?")[0]
+                status, headers, content = hub.answer(self.command, path, body, allowed)
+                if not isinstance(content, bytes):
+                    content = json.dumps(content).encode()
+                self.send_response(status)
+                for name, value in (headers | {"Content-Length": str(len(content))}).items():
+                    self.send_header(name, value)
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(content)
 
             do_HEAD = do_POST = do_PUT = do_GET
 
-            def log_message(self, *args) -> None:
-                pass
+            def log_message(self, *args): ...
 
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self.address = f"http://127.0.0.1:{self.server.server_port}"
         self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
         self.thread.start()
 
-    def answer(self, request: BaseHTTPRequestHandler) -> None:
-        raise NotImplementedError
-
-    def close(self) -> None:
+    def close(self):
         self.server.shutdown()
         self.server.server_close()
         self.thread.join()
@@ -56,10 +66,8 @@ def reachable(monkeypatch, address: str) -> None:
 
 
 class Repository:
-    def __init__(self, private: bool) -> None:
-        self.private = private
-        self.branches: dict[str, str] = {}
-        self.commits: dict[str, dict[str, bytes]] = {}
+    def __init__(self, private):
+        self.private, self.branches, self.commits = private, {}, {}
         self.commit("main", {})
 
     def commit(self, branch: str, files: dict[str, bytes]) -> str:
@@ -77,38 +85,16 @@ class Repository:
 class ModelHub(Loopback):
     """Repositories by name, and the requests that were made, as ``"METHOD path"``."""
 
-    def __init__(self) -> None:
-        self.repositories: dict[str, Repository] = {}
-        self.objects: dict[str, bytes] = {}
-        self.requests: list[str] = []
+    def __init__(self):
+        self.repositories, self.objects, self.requests = {}, {}, []
         super().__init__()
 
     def files(self, name: str, revision: str = "main") -> dict[str, bytes]:
         repository = self.repositories[name]
         return repository.commits[repository.at(revision)]
 
-    def answer(self, request: BaseHTTPRequestHandler) -> None:
-        method, path = request.command, request.path.partition("?")[0]
+    def answer(self, method, path, body, allowed):
         self.requests.append(f"{method} {path}")
-        body = request.rfile.read(int(request.headers.get("Content-Length") or 0))
-        if request.headers.get("Transfer-Encoding") == "chunked":
-            body = b""
-            while size := int(request.rfile.readline(), 16):
-                body += request.rfile.read(size)
-                request.rfile.readline()
-            request.rfile.readline()
-        allowed = request.headers.get("Authorization") == f"Bearer {TOKEN}"
-        status, headers, content = self._answer(method, path, body, allowed)
-        if not isinstance(content, bytes):
-            content = json.dumps(content).encode()
-        request.send_response(status)
-        for name, value in ({"Content-Length": str(len(content))} | headers).items():
-            request.send_header(name, value)
-        request.end_headers()
-        if method != "HEAD":
-            request.wfile.write(content)
-
-    def _answer(self, method, path, body, allowed):
         if path == "/api/validate-yaml":
             return 200, {}, {"errors": [], "warnings": []}
         if path.startswith("/objects/"):
@@ -124,17 +110,13 @@ class ModelHub(Loopback):
         if method == "POST" and not allowed:
             return 403, {"X-Error-Message": "no permission"}, b""
         if what == "preupload":
-            files = json.loads(body)["files"]
-            mode = {True: "lfs", False: "regular"}
-            modes = [
-                {
-                    "path": f["path"],
-                    "uploadMode": mode[f["path"].endswith(".safetensors")],
-                    "shouldIgnore": False,
-                }
-                for f in files
+            paths = [file["path"] for file in json.loads(body)["files"]]
+            modes = ["lfs" if path.endswith(".safetensors") else "regular" for path in paths]
+            files = [
+                {"path": path, "uploadMode": mode, "shouldIgnore": False}
+                for path, mode in zip(paths, modes, strict=True)
             ]
-            return 200, {}, {"files": modes}
+            return 200, {}, {"files": files}
         if what == "info" and rest.startswith("lfs"):
             objects = [
                 o | {"actions": {"upload": {"href": f"{self.address}/objects/{o['oid']}"}}}
@@ -155,14 +137,14 @@ class ModelHub(Loopback):
         files = repository.commits[commit]
         if what == "tree":
             listed = [
-                {"type": "file", "path": path, "size": len(content), "oid": _etag(content)}
+                {"type": "file", "path": path, "size": len(content), "oid": etag(content)}
                 for path, content in files.items()
             ]
             return 200, {}, listed
         if file not in files:
             return 404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": commit}, b""
         content = files[file]
-        return 200, {"ETag": f'"{_etag(content)}"', "X-Repo-Commit": commit}, content
+        return 200, {"ETag": f'"{etag(content)}"', "X-Repo-Commit": commit}, content
 
     def _create(self, asked, allowed):
         if not allowed:
@@ -187,7 +169,7 @@ class ModelHub(Loopback):
         return 200, {}, {"commitUrl": url, "commitOid": oid, "hookOutput": ""}
 
 
-def _etag(content: bytes) -> str:
+def etag(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 

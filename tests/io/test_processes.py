@@ -1,7 +1,3 @@
-"""Fresh processes: errors arrive, nothing hangs, and nobody outlives whoever started them."""
-
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -16,6 +12,7 @@ import pytest
 pytest.importorskip("loky")
 
 from lab.workers import working
+from tests.errors import raises
 from tests.processes import ended
 from warmprior.io.workers import WorkerError
 
@@ -57,7 +54,7 @@ def sleepers(folder, count):
 
 def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_all(tmp_path):
     state = []
-    with pytest.raises(FloatingPointError, match="the loss became nan"), working(2, state) as call:
+    with raises(FloatingPointError, "the loss became nan"), working(2, state) as call:
         found = [call(partial(remember, i)).result() for i in range(6)]
         pid, threads, _ = call(facts).result()
         call(partial(sleep, tmp_path / "x"))
@@ -72,8 +69,7 @@ def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_a
 
 
 def test_a_dead_process_ends_all_others(tmp_path):
-    said = "one of 2 workers died.*memory.*fewer workers"
-    with pytest.raises(WorkerError, match=said) as raised, working(2, None) as call:
+    with raises(WorkerError, 2, "memory") as raised, working(2, None) as call:
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)
         call(kill_oneself).result()

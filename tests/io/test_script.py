@@ -1,13 +1,8 @@
-"""Scripts: Ctrl-C is one line, and errors of ours are not hidden."""
-
-from __future__ import annotations
-
 import os
 import signal
 import time
 
-import pytest
-
+from tests.errors import raises
 from warmprior.io.script import run_script
 
 
@@ -29,5 +24,5 @@ def test_errors_of_ours_are_not_hidden():
     def script():
         raise TypeError("a defect")
 
-    with pytest.raises(TypeError, match="a defect"):
+    with raises(TypeError, "a defect"):
         run_script(script, "a.py")
