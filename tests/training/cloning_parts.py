@@ -1,23 +1,16 @@
 """A tiny behaviour cloning with dropout, whose every draw has to be restored."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from torch import nn
 
+from tests.states import copied
 from tests.toy_env import demonstrations
 from warmprior import ChiTransformer, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import BehaviourCloning, TrainingConfig
 
-CONFIG = TrainingConfig(
-    iterations=40,
-    batch_size=16,
-    learning_rate=1e-2,
-    checkpoints=2,
-    save_every=7,
-    log_every=10,
-    cold_probability=0.25,
-)
+SAVES = {"checkpoints": 2, "save_every": 7, "log_every": 10}
+CONFIG = TrainingConfig(iterations=40, batch_size=16, learning_rate=1e-2, cold_probability=0.25, **SAVES)
 
 
 def dataset():
@@ -28,9 +21,8 @@ def actor_for(prior=None, network=None):
     prior = PastPrior(4) if prior is None else prior
     torch.manual_seed(7)
     if network is None:  # with dropout: the global generator has to be restored too
-        network = ChiTransformer(
-            2, 3, prior.prediction_length, embedding_dim=8, num_layers=1, num_heads=2, dropout=0.2
-        )
+        sizes = {"embedding_dim": 8, "num_layers": 1, "num_heads": 2}
+        network = ChiTransformer(2, 3, prior.prediction_length, dropout=0.2, **sizes)
     return WarmPriorActor(network, prior, nfe=2)
 
 
@@ -56,14 +48,14 @@ def run_until(cloning, iteration):
 
 
 def weights(cloning):
-    return {
-        **{f"net.{n}": v.clone() for n, v in cloning.actor.network.state_dict().items()},
-        **{f"ema.{n}": v.clone() for n, v in cloning.update.ema.state_dict().items()},
-    }
+    parts = nn.ModuleDict({"net": cloning.actor.network, "ema": cloning.update.ema})
+    return copied(parts.state_dict())
 
 
-def same(one, two):
-    return one.keys() == two.keys() and all(torch.equal(one[k], two[k]) for k in one)
+def finished(folder, *args, **options):
+    cloning = training(folder, *args, **options)
+    cloning.run(None)
+    return cloning
 
 
 def mlp():

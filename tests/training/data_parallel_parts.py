@@ -1,7 +1,5 @@
 """What each of several processes does in the tests of data parallel training."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

@@ -1,7 +1,5 @@
 """Training: the loop by hand, and the same result however often it is killed."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import multiprocessing
@@ -11,14 +9,17 @@ import time
 
 import pytest
 import torch
+from torch import nn
 
+from tests.errors import raises
+from tests.states import same
 from tests.training.cloning_parts import (
     CONFIG,
     actor_for,
     dataset,
+    finished,
     mlp,
     run_until,
-    same,
     training,
     weights,
 )
@@ -42,8 +43,7 @@ def test_the_loop_by_hand(tmp_path, options):
     config = dataclasses.replace(CONFIG, **changes | options)
     network = VelocityMLP(2, 3, 4, hidden_dim=8)
     other, average = copy.deepcopy(network), copy.deepcopy(network)
-    cloning = training(tmp_path, config, actor=actor_for(network=network))
-    cloning.run()
+    cloning = finished(tmp_path, config, actor=actor_for(network=network))
 
     actor = actor_for(network=other)
     generator = torch.Generator().manual_seed(config.seed)
@@ -84,11 +84,9 @@ def test_the_loop_by_hand(tmp_path, options):
         with torch.no_grad():
             for mean, now in zip(average.parameters(), other.parameters(), strict=True):
                 mean.copy_(now if step == 0 else 0.9 * mean + 0.1 * now)
-    for name, value in other.state_dict().items():
-        torch.testing.assert_close(cloning.actor.network.state_dict()[name], value)
+    torch.testing.assert_close(cloning.actor.network.state_dict(), other.state_dict())
     kept = load_policy(cloning.policy_path(12)).network
-    for name, value in average.state_dict().items():
-        torch.testing.assert_close(kept.state_dict()[name], value)
+    torch.testing.assert_close(kept.state_dict(), average.state_dict())
     assert padded > 0
     if clipped is not None:
         assert min(lengths) < 0.1 * clipped < max(lengths)
@@ -99,15 +97,16 @@ def test_the_loop_by_hand(tmp_path, options):
 
 @pytest.mark.parametrize(
     ("stop", "recipe", "options"),
-    [(6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True}), (16, LATER, {}), (16, PUBLIC, {})],
+    [
+        *((6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True})),
+        *((16, LATER, {}), (16, PUBLIC, {}), (16, {"precision": "bf16"}, {})),
+    ],
 )
 def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):
     """Without a kill: an exception in the middle of the loop, then a new object."""
     config = dataclasses.replace(CONFIG, **recipe)
-    whole = training(tmp_path / "whole", config, **options)
-    whole.run()
-    part = training(tmp_path / "part", config, **options)
-    run_until(part, stop)
+    whole = finished(tmp_path / "whole", config, **options)
+    run_until(training(tmp_path / "part", config, **options), stop)
     torch.rand(100)  # whatever else uses the global generator in between
     again = training(tmp_path / "part", config, **options)
     assert again.iteration == max(i for i in (0, 7, 14, 20, 21, 28, 35) if i <= stop)
@@ -123,8 +122,17 @@ def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):
             assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
-@pytest.mark.parametrize(("precision", "compiled"), [("float32", False), ("bf16", False), ("bf16", True)])
-def test_a_gradient_is_shortened_to_the_norm_and_keeps_its_direction(tmp_path, precision, compiled):
+SLOWLY = pytest.param("bf16", "inductor", marks=pytest.mark.slow)  # it calls a compiler of C++
+
+
+@pytest.mark.parametrize(
+    ("precision", "backend"), [("float32", None), ("bf16", None), ("bf16", "eager"), SLOWLY]
+)
+def test_a_gradient_is_shortened_to_the_norm_and_keeps_its_direction(
+    tmp_path, monkeypatch, precision, backend
+):
+    compiled, compile_ = backend is not None, nn.Module.compile
+    monkeypatch.setattr(nn.Module, "compile", lambda module, **options: compile_(module, backend=backend))
     gradients = {}
     for norm in (None, 1e-2, 1e9):
         config = dataclasses.replace(CONFIG, max_grad_norm=norm, precision=precision)
@@ -137,11 +145,9 @@ def test_a_gradient_is_shortened_to_the_norm_and_keeps_its_direction(tmp_path, p
 
 
 def test_a_finished_training_stays_as_it_is(tmp_path):
-    first = training(tmp_path)
-    first.run()
+    first = finished(tmp_path)
     before = (tmp_path / "state.safetensors").read_bytes()
-    again = training(tmp_path)
-    again.run()
+    again = finished(tmp_path)
     assert again.iteration == 40 and again.losses == first.losses
     assert same(weights(again), weights(first))
     assert (tmp_path / "state.safetensors").read_bytes() == before
@@ -158,32 +164,25 @@ def killed_training(folder, iterations):
 )
 def test_killed_and_resumed_is_bitwise_the_same(tmp_path, iterations, moments):
     """SIGKILL that long after the first save; saves are so frequent that many hit one."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        whole = killed_training(tmp_path / "whole", iterations)
-        whole.run()
-        folder, context = tmp_path / "killed", multiprocessing.get_context("fork")
-        reached = 0
-        for moment in moments:
-            process = context.Process(target=lambda: killed_training(folder, iterations).run(None))
-            process.start()
-            deadline = time.monotonic() + 120
-            while time.monotonic() < deadline and process.is_alive():
-                if _iteration(folder) > reached:
-                    break
-                time.sleep(0.02)
-            time.sleep(moment)
-            process.kill()
-            process.join(30)
-            assert process.exitcode == -signal.SIGKILL, "finished before it was killed"
-            reached = _iteration(folder)
-        assert 0 < reached < iterations
-        again = killed_training(folder, iterations)
-        assert again.iteration == reached
-        again.run()
-    finally:
-        torch.set_num_threads(threads)
+    whole = killed_training(tmp_path / "whole", iterations)
+    whole.run()
+    folder, context = tmp_path / "killed", multiprocessing.get_context("fork")
+    reached = 0
+    for moment in moments:
+        process = context.Process(target=lambda: killed_training(folder, iterations).run(None))
+        process.start()
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and process.is_alive() and _iteration(folder) <= reached:
+            time.sleep(0.02)
+        time.sleep(moment)
+        process.kill()
+        process.join(30)
+        assert process.exitcode == -signal.SIGKILL, "finished before it was killed"
+        reached = _iteration(folder)
+    assert 0 < reached < iterations
+    again = killed_training(folder, iterations)
+    assert again.iteration == reached
+    again.run()
     assert same(weights(again), weights(whole))
     assert again.losses == whole.losses
 
@@ -193,18 +192,13 @@ def _iteration(folder):
     return load_state(path)[1]["iteration"] if path.exists() else 0
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"iterations": 3.5}, "iterations must be a whole number of at least 1, got 3.5"),
-        ({"save_every": 0}, "save_every must be a whole number"),
-        ({"seed": -1}, "seed must be a whole number from 0"),
-        ({"learning_rate": "fast"}, "learning_rate must be a finite number, got 'fast'"),
-    ],
-)
-def test_recipes_that_cannot_be(options, said):
-    with pytest.raises(ValueError, match=said):
-        TrainingConfig(**options)
+def test_recipes_that_cannot_be():
+    wrong = {"iterations": [3.5], "save_every": [0], "seed": [-1], "learning_rate": ["fast"]}
+    wrong["max_grad_norm"] = [0.0, -1.0, float("inf"), float("nan")]
+    for name, values in wrong.items():
+        for value in values:
+            with raises(ValueError, name, value):
+                TrainingConfig(**{name: value})
 
 
 def test_checkpoints_are_evenly_spaced():

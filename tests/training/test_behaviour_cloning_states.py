@@ -1,20 +1,18 @@
-"""Training states that were damaged or lost their policies, and networks of users' own."""
-
-from __future__ import annotations
-
 import shutil
 
 import pytest
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, run_until, same, training, weights
-from warmprior import PastPrior, VelocityMLP
+from tests.errors import raises
+from tests.states import same
+from tests.training.cloning_parts import CONFIG, actor_for, finished, run_until, training, weights
+from warmprior import VelocityMLP
 from warmprior.training import load_policy
 
 
 def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):
-    training(tmp_path).run()
+    finished(tmp_path)
     policy = tmp_path / "policy_000040"
     before = {path.name: path.read_bytes() for path in policy.iterdir()}
     for lose in (shutil.rmtree, lambda policy: (policy / "model.safetensors").write_bytes(b"")):
@@ -27,11 +25,10 @@ def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):
     content = bytearray(path.read_bytes())
     content[-40_000] ^= 4
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"state\.safetensors is not a readable training state"):
+    with raises(ValueError, "state.safetensors"):
         training(tmp_path)
 
 
-# --------------------------------------------------------------------------- users' own parts
 class Plain(nn.Module):
     def __init__(self):
         super().__init__()
@@ -54,44 +51,32 @@ def grown():
     return network
 
 
-def _actor(network):
-    return actor_for(PastPrior(4), network)
+def test_what_cannot_be_saved_is_refused_before_training(tmp_path):
+    for network, error, fact in ((Plain(), TypeError, "Plain"), (grown(), ValueError, "extra")):
+        with raises(error, fact):
+            training(tmp_path / "run", actor=actor_for(network=network))
 
 
-@pytest.mark.parametrize(
-    ("network", "error", "said"),
-    [
-        (Plain, TypeError, "cannot save Plain: only subclasses of VelocityNetwork"),
-        (grown, ValueError, "could not be loaded again"),
-    ],
-)
-def test_what_cannot_be_saved_is_refused_before_training(tmp_path, network, error, said):
-    with pytest.raises(error, match=said):
-        training(tmp_path / "run", actor=_actor(network()))
+NETWORKS = {
+    "tied": lambda: Tied(2, 3, 4, hidden_dim=8),
+    "compiled": lambda: torch.compile(VelocityMLP(2, 3, 4, hidden_dim=8), backend="eager"),
+}
 
 
-def _compiled():
-    return torch.compile(VelocityMLP(2, 3, 4, hidden_dim=8), backend="eager")
-
-
-@pytest.mark.parametrize(
-    "network", [lambda: Tied(2, 3, 4, hidden_dim=8), _compiled], ids=["tied", "compiled"]
-)
+@pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
 def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     def build():
         torch.manual_seed(5)
-        return _actor(network())
+        return actor_for(network=network())
 
-    whole = training(tmp_path / "whole", actor=build())
-    whole.run()
-    part = training(tmp_path / "part", actor=build())
-    run_until(part, 25)
+    whole = finished(tmp_path / "whole", actor=build())
+    run_until(training(tmp_path / "part", actor=build()), 25)
     again = training(tmp_path / "part", actor=build())
     assert again.iteration == 21
     again.run()
     assert same(weights(again), weights(whole))
     policy = load_policy(whole.policy_path(CONFIG.iterations))
     assert not any("_orig_mod" in name for name in policy.state_dict())
-    expected = [value for value in whole.update.ema.module.state_dict().values()]
-    for one, two in zip(policy.network.state_dict().values(), expected, strict=True):
-        assert torch.equal(one, two)
+    averaged = whole.update.ema.module.state_dict().values()
+    pairs = zip(policy.network.state_dict().values(), averaged, strict=True)
+    assert all(torch.equal(*pair) for pair in pairs)

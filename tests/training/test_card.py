@@ -1,7 +1,3 @@
-"""The card of a policy, and where its numbers come from."""
-
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -12,19 +8,13 @@ from scipy import stats
 
 import warmprior
 from lab.report import policy_results
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from tests.toy_env import mlp_actor
+from warmprior import PastPrior
 from warmprior.training import model_card
 
-ACTOR = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
-FACTS = {
-    "task": "drift",
-    "data": "own",
-    "prior": "past",
-    "options": "",
-    "sigma": 0.5,
-    "chunk": 4,
-    "iterations": 20,
-}
+ACTOR = mlp_actor(PastPrior(4))
+FACTS = {"task": "drift", "data": "own", "prior": "past", "options": "", "sigma": 0.5, "chunk": 4}
+FACTS["iterations"] = 20
 
 
 def row(seed, checkpoint, nfe, solved, **more):
@@ -48,22 +38,15 @@ def run(tmp_path):
     """What a benchmark leaves, and where its policies lie."""
     folder = tmp_path / "run"
     folder.mkdir()
-    write(folder, [*OTHERS, *ROWS])
+    (folder / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in (*OTHERS, *ROWS)))
     facts = {"task": "drift", "data": "own", "source": "scripted", "steps": 75}
     (folder / "tasks.json").write_text(json.dumps([{"task": "lift", "data": "ph"}, facts]))
     return folder
 
 
-def write(folder, rows):
-    (folder / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def at(run, seed=0, checkpoint=20):
-    return run.parent / "policies" / f"drift-own-past-seed{seed}" / f"policy_{checkpoint:06d}"
-
-
 def test_its_numbers_are_those_of_the_results(run):
-    card = model_card(ACTOR, policy_results(run, at(run)), repository="me/drift", licence="mit")
+    policy = run.parent / "policies" / "drift-own-past-seed0" / "policy_000020"
+    card = model_card(ACTOR, policy_results(run, policy), repository="me/drift", licence="mit")
     for mine in (r for r in ROWS if (r["seed"], r["checkpoint"]) == (0, 20)):
         k = mine["successes"]
         low, high = stats.beta(1 + k, 6 - k).interval(0.95)

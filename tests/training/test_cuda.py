@@ -3,8 +3,6 @@
 pytest -m cuda                 # or: make gpu PART=1
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest
@@ -12,6 +10,7 @@ import torch
 
 from lab.tasks import navigation_task
 from tests.rl.training_parts import ALGORITHMS, make_actor, make_training
+from tests.states import copied, same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, training, weights
 from tests.training.test_synchronisation import CASES
 from warmprior import PastPrior, window_replay_buffer
@@ -30,7 +29,6 @@ def on_gpu(folder, config=CONFIG, *, data=None, actor=None, **options):
 
 
 def distance(one, two):
-    """The largest difference of any weight."""
     one, two = ({name: value.cpu() for name, value in weights(each).items()} for each in (one, two))
     return max(float((one[name] - two[name]).abs().max()) for name in one)
 
@@ -126,11 +124,10 @@ def test_a_policy_trains_compiled_and_plays_on_the_gpu(tmp_path):
 def test_an_agent_learns_on_the_gpu_and_is_found_again(tmp_path, algorithm):
     options = {"actor": make_actor().to(GPU), "env": {"actor": make_actor()}, "algorithm": algorithm}
     agent = make_training(tmp_path, **options)
-    fresh = {name: value.clone() for name, value in agent.agent.state().items()}
+    fresh = copied(agent.agent.state())
     curve = agent.run()
     assert "rng_cuda" in load_state(agent.state_path)[0]
     again = make_training(tmp_path, **options)
     assert again.curve == curve and curve
-    learnt, found = agent.agent.state(), again.agent.state()
-    assert all(torch.equal(found[name], learnt[name]) for name in learnt)
-    assert not all(torch.equal(fresh[name], learnt[name]) for name in learnt)
+    assert same(agent.agent.state(), again.agent.state())
+    assert not same(agent.agent.state(), fresh)

@@ -1,12 +1,9 @@
-"""Several processes train one policy: equal weights, the files of one, resuming, and errors for all."""
-
-from __future__ import annotations
-
 import time
 
 import pytest
 import torch
 
+from tests.states import same
 from tests.together import together
 from tests.training.cloning_parts import CONFIG
 from tests.training.data_parallel_parts import CASES, CLIPPED, STEPS, cloning, dies, whole
@@ -16,7 +13,6 @@ from warmprior.training.checkpoint import load_state
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """What two processes left."""
     folder = tmp_path_factory.mktemp("together")
     for name in ("one", "two"):
         (folder / name).mkdir()
@@ -28,16 +24,12 @@ def both(folder, name):
     return [torch.load(folder / f"{name} {number}.pt") for number in range(2)]
 
 
-def equal(one, two):
-    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_each_draws_windows_of_its_own_and_all_take_one_step(folder, case):
     (loss, gradients, points), (other_loss, other_gradients, others) = (
         first[case] for first in both(folder, "first")
     )
-    assert not torch.equal(loss, other_loss) and equal(gradients, other_gradients)
+    assert not torch.equal(loss, other_loss) and same(gradients, other_gradients)
     assert any(gradient.abs().max() > 1e-3 for gradient in gradients.values())
     assert points[0].shape == others[0].shape and len(points[0]) == CONFIG.batch_size // 2
     assert not torch.isclose(points[0], others[0]).all(-1).all(-1).any()
@@ -68,7 +60,7 @@ def test_the_windows_of_the_others_count(folder, tmp_path):
 @pytest.mark.parametrize("case", CASES)
 def test_weights_are_equal_and_the_leader_alone_writes(folder, case):
     (mine, _), (theirs, _) = both(folder, case)
-    assert equal(mine, theirs)
+    assert same(mine, theirs)
     names = sorted(path.name for path in (folder / case).iterdir())
     assert names == ["policy_000020", "state.safetensors"]
     assert load_state(folder / case / "state.safetensors")[1]["iteration"] == STEPS.iterations
@@ -80,11 +72,11 @@ def test_weights_are_equal_and_the_leader_alone_writes(folder, case):
 
 def test_a_stopped_training_goes_on(folder):
     (mine, losses), (theirs, _) = both(folder / "one", "plain")
-    assert equal(mine, theirs)
+    assert same(mine, theirs)
     assert [iteration for iteration, _ in losses] == [10, 20]
     assert losses[0] == both(folder, "plain")[0][1][0]
     again, _ = both(folder / "two", "plain")[0]
-    assert equal(mine, again)
+    assert same(mine, again)
 
 
 def test_all_learn_of_nan_in_one(folder):

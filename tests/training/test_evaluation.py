@@ -1,7 +1,5 @@
 """Evaluation: every episode once, whatever the environment, and no hang when a worker dies."""
 
-from __future__ import annotations
-
 import copy
 import multiprocessing
 import os
@@ -20,8 +18,9 @@ from torchrl._utils import _check_for_faulty_process
 from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
+from tests.errors import raises
 from tests.processes import ended
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
 from warmprior import (
     GaussianPrior,
     Normalizer,
@@ -30,7 +29,6 @@ from warmprior import (
     PriorAnchor,
     PriorDecoder,
     ResidualSampler,
-    VelocityMLP,
     WarmPriorActor,
     policy_transforms,
 )
@@ -88,37 +86,34 @@ def expected(first_seed, episodes):
 class Recorder(nn.Module):
     """A velocity that depends on the observation, and remembers which episodes it saw."""
 
-    def __init__(self, seen=None):
+    def __init__(self):
         super().__init__()
-        self.weight = nn.Parameter(torch.tensor(0.1))
-        self.seen = set() if seen is None else seen
+        self.weight, self.seen = nn.Parameter(torch.tensor(0.1)), set()
 
     def forward(self, t, a, observation):
         self.seen.update(observation[:, -1, 1].int().tolist())
         return self.weight * observation.mean((1, 2))[:, None, None] - a
 
 
-def environments(num_envs, prior=None, **options):
-    prior = PastPrior(H) if prior is None else prior
-    return parallel_env(partial(SeededEnv, **options), partial(policy_transforms, prior), num_envs)
+PRIOR = PastPrior(H)
 
 
-def actor_for(prior=None):
-    prior = PastPrior(H) if prior is None else prior
+def environments(num_envs, **options):
+    return parallel_env(partial(SeededEnv, **options), partial(policy_transforms, PRIOR), num_envs)
+
+
+def actor_for(prior=PRIOR):
     return WarmPriorActor(Recorder(), prior, nfe=2)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_every_episode_once(num_envs):
-    env = environments(num_envs)
-    try:
+    with closing(environments(num_envs)) as env:
         for episodes in (1, 3, 7):
             actor = actor_for()
             result = evaluate(actor, env, episodes=episodes, first_seed=100)
             assert result == expected(100, episodes)
             assert set(range(100, 100 + episodes)) <= actor.network.seen
-    finally:
-        env.close(raise_if_closed=False)
 
 
 class NoiseSuccess(SeededEnv):
@@ -136,8 +131,7 @@ class PlainEnv(SeededEnv):
         super().__init__(log=log)
 
 
-def single(make_env=PlainEnv, prior=None):
-    prior = PastPrior(H) if prior is None else prior
+def single(make_env=PlainEnv, prior=PRIOR):
     return TransformedEnv(make_env(), policy_transforms(prior))
 
 
@@ -187,14 +181,11 @@ def test_the_noise_of_an_episode_is_that_of_the_documented_seed():
 
 
 def test_actor_is_left_as_it_was_but_for_its_mode():
-    env = environments(1)
     generator = torch.Generator().manual_seed(5)
     actor = WarmPriorActor(Recorder(), PastPrior(H), nfe=2, generator=generator).train()
     state, before = generator.get_state(), torch.get_rng_state()
-    try:
+    with closing(environments(1)) as env:
         evaluate(actor, env, episodes=1, first_seed=0)
-    finally:
-        env.close(raise_if_closed=False)
     assert actor.sampler.generator is generator
     assert torch.equal(generator.get_state(), state)
     assert torch.equal(torch.get_rng_state(), before)
@@ -205,11 +196,10 @@ def test_actor_is_left_as_it_was_but_for_its_mode():
 def test_a_killed_worker_is_an_error_and_not_a_hang(moment):
     """TorchRL alone would wait for hours; the watcher looks twice a second."""
     env = environments(2, sleep=0.02)
-    result: list[BaseException] = []
+    result = []
 
     def kill():
-        worker = env._workers[1]
-        os.kill(worker.pid, signal.SIGKILL)
+        os.kill(env._workers[1].pid, signal.SIGKILL)
 
     def run():
         try:
@@ -243,7 +233,7 @@ def test_a_worker_that_torchrl_finds_dead_first_is_named(closed):
     env = environments(2, sleep=0.02)
     env.reset()
     workers = env._workers
-    with pytest.raises(WorkerError, match=r"worker 1 of 2 \(exit code -9\) died"), watched(env):
+    with raises(WorkerError, "worker 1 of 2", "exit code -9"), watched(env):
         os.kill(workers[1].pid, signal.SIGKILL)
         workers[1].join()
         if closed:
@@ -294,7 +284,7 @@ def test_any_policy_that_writes_chunks():
     transforms = partial(policy_transforms, prior)
     env = TransformedEnv(parallel_env(NoiseSuccess, transforms, 2), PriorAnchor(actor))
     play = partial(evaluate, policy, env, episodes=6, first_seed=3)
-    try:
+    with closing(env):
         torch.manual_seed(0)
         before = torch.get_rng_state()
         one = play()
@@ -302,26 +292,21 @@ def test_any_policy_that_writes_chunks():
         assert torch.equal(torch.get_rng_state(), before)
         torch.rand(5)
         again, other = play(), play(policy_seed=1)
-    finally:
-        env.close(raise_if_closed=False)
-
     assert again == one and torch.equal(chunks_of(again), chunks_of(one))
     assert not torch.isclose(chunks_of(other)[:3], chunks_of(one)[:3]).any()
 
 
 def batched(kind, make_env, num_envs, transforms_inside=False):
-    prior = PastPrior(H)
     options = {"mp_start_method": "fork"} if kind is ParallelEnv else {}
     if transforms_inside:
-        return kind(num_envs, partial(single, make_env, prior), **options)
-    return TransformedEnv(kind(num_envs, make_env, **options), policy_transforms(prior))
+        return kind(num_envs, partial(single, make_env), **options)
+    return TransformedEnv(kind(num_envs, make_env, **options), policy_transforms(PRIOR))
 
 
 @pytest.mark.parametrize(("kind", "inside"), [(SerialEnv, False), (ParallelEnv, True)])
 def test_any_batched_environment_plays_every_seed_once(kind, inside, tmp_path):
     log = tmp_path / "resets"
-    env = batched(kind, partial(PlainEnv, log=log), 3, inside)
-    try:
+    with closing(batched(kind, partial(PlainEnv, log=log), 3, inside)) as env:
         actor = actor_for()
         for first, episodes in ((40, 7), (5, 2)):
             before = len(log.read_text().split()) if log.exists() else 0
@@ -330,8 +315,6 @@ def test_any_batched_environment_plays_every_seed_once(kind, inside, tmp_path):
             assert set(range(first, first + episodes)) <= actor.network.seen
             played = [int(line) for line in log.read_text().split()][before:]
             assert set(range(first, first + episodes)) <= set(played)
-    finally:
-        env.close(raise_if_closed=False)
 
 
 @pytest.mark.parametrize("form", ["partial", "nested", "keywords"])
@@ -344,22 +327,21 @@ def test_offsets_of_one_s_own_are_refused(form):
     env = SerialEnv(2, make_env, **options)
     if form != "nested":
         env = TransformedEnv(env, policy_transforms(PastPrior(H)))
-    with pytest.raises(ValueError, match="leave out seed_offset"):
+    with raises(ValueError, "seed_offset"):
         evaluate(actor_for(), env, episodes=3, first_seed=7)
 
 
 def test_environments_that_cannot_be_judged():
-    with pytest.raises(KeyError, match=r"does not write .*success"):
+    with raises(KeyError, "success"):
         evaluate(actor_for(), single(CountingEnv), episodes=1, first_seed=0)
-    with pytest.raises(KeyError, match="policy_transforms"):
+    with raises(KeyError, "policy_transforms"):
         evaluate(actor_for(), PlainEnv(), episodes=1, first_seed=0)
 
 
 def test_policy_and_environment_need_one_normaliser():
     ones = {"observation": torch.ones(2 + ACTION_DIM), "action": torch.ones(ACTION_DIM)}
     mine, other = (Normalizer({k: -s * v for k, v in ones.items()}, ones) for s in (1.0, 3.0))
-    network = VelocityMLP(ACTION_DIM, 2 + ACTION_DIM, H, hidden_dim=8)
-    actor = WarmPriorActor(network, PastPrior(H), nfe=1, normalizer=mine)
+    actor = mlp_actor(PRIOR, nfe=1, normalizer=mine)
 
     def play(normalizer):
         transforms = policy_transforms(PastPrior(H), normalizer=normalizer)
@@ -379,6 +361,6 @@ def test_policy_and_environment_need_one_normaliser():
     seen = TransformedEnv(SeededEnv(), Compose(*alone.env_transforms(), policy_transforms(PastPrior(H))))
     kept = actor.replace(normalizer=copy.deepcopy(alone).to(torch.bfloat16))
     assert evaluate(kept, seen, episodes=1, first_seed=0)[0].steps == length_of(0)
-    for wrong, said in ((None, "has none for"), (other, "has another for")):
-        with pytest.raises(ValueError, match=f"{said}.*normalizer=policy.normalizer"):
+    for wrong in (None, other):
+        with raises(ValueError, "normalizer=policy.normalizer"):
             play(wrong)

@@ -1,7 +1,3 @@
-"""Optimiser, schedule and averaging against their formulas."""
-
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,15 +1,11 @@
-"""Data beside the network or behind it, and batches that are gathered ahead without losing a draw."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 
+from tests.errors import raises
 from warmprior.training.placement import Prefetch
 
 
 def numbers(seed=0):
-    """A source of batches and its generator."""
     generator = torch.Generator().manual_seed(seed)
     return (lambda: torch.rand(3, generator=generator)), generator
 
@@ -34,5 +30,5 @@ def test_an_error_of_the_thread_is_told_where_the_batch_is_asked_for():
     def failing():
         raise OSError("the disk is gone")
 
-    with pytest.raises(OSError, match="the disk is gone"):
+    with raises(OSError, "the disk is gone"):
         Prefetch(failing, torch.Generator())()

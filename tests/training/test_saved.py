@@ -1,7 +1,3 @@
-"""Saved policies: bit-identical again, or refused where they were damaged, swapped or never could be."""
-
-from __future__ import annotations
-
 import math
 import multiprocessing
 import os
@@ -13,6 +9,8 @@ from tensordict import TensorDict
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.errors import raises
+from tests.states import same
 from tests.toy_env import Halfway, random_history
 from warmprior import (
     ChiTransformer,
@@ -53,11 +51,9 @@ def saved(folder, *parts, **options):
 
 
 def chunk(actor, **options):
-    """The chunk of one decision that is the same for all."""
     torch.manual_seed(7)
     data = TensorDict({"history": random_history(actor.prior, 4, action_dim=D_A)}, [4])
-    width = actor.network.observation_dim
-    data[actor.observation_key] = torch.randn(4, TO, width)
+    data[actor.observation_key] = torch.randn(4, TO, actor.network.observation_dim)
     data[keys.DELAY] = torch.full((4, 1), 1)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -101,9 +97,7 @@ def test_round_trip_is_bit_identical(tmp_path, make):
     config = policy_config(actor)
     assert policy_config(again) == policy_config(actor.replace()) == config
     assert torch.equal(chunk(again), chunk(actor))
-    mine, theirs = actor.state_dict(), again.state_dict()
-    assert mine.keys() == theirs.keys()
-    assert all(torch.equal(theirs[name], value) for name, value in mine.items())
+    assert same(actor.state_dict(), again.state_dict())
 
 
 def test_a_user_s_prior_travels(tmp_path):
@@ -113,7 +107,7 @@ def test_a_user_s_prior_travels(tmp_path):
     saved(tmp_path, Still(H))
     assert type(load_policy(tmp_path).prior) is Still
     del Prior.classes["still-for-this-test"]
-    with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*import the module"):
+    with raises(ValueError, "'still-for-this-test'"):
         load_policy(tmp_path)
 
 
@@ -129,12 +123,8 @@ def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
     mine, theirs = actor.state_dict(), again.state_dict()
     others = set() if parts == "all" else {torch.float32}
     assert {value.dtype for value in mine.values()} == {dtype} | others
-    assert all(theirs[name].dtype == value.dtype for name, value in mine.items())
-    assert all(torch.equal(theirs[name], value) for name, value in mine.items())
+    assert same(mine, theirs) and all(theirs[name].dtype == value.dtype for name, value in mine.items())
     assert torch.equal(chunk(again), chunk(actor))
-
-
-# ------------------------------------------------------------------------------- what cannot be saved
 
 
 @pytest.mark.parametrize("where", ["os.replace", "warmprior.training.checkpoint.save_file", "os.fsync"])
@@ -147,26 +137,10 @@ def test_a_full_disk_leaves_the_old_policy(tmp_path, monkeypatch, where):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(where, full)
-    with pytest.raises(OSError, match=f"cannot write {tmp_path}.*No space left"):
+    with raises(OSError, tmp_path, "No space left"):
         saved(tmp_path, PastPrior(H, sigma=0.7))
     monkeypatch.undo()
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
-
-
-# ---------------------------------------------------------------------------- what cannot be loaded
-
-
-def test_missing_files(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no policy at .*nowhere: model.safetensors is miss"):
-        load_policy(tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("version", [5, None, "7"])
-def test_another_format(tmp_path, version):
-    saved(tmp_path)
-    rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*this version reads 7"):
-        load_policy(tmp_path)
 
 
 @pytest.mark.parametrize("damage", [0, 4, 100, -1, "config", "weight", "plain"])
@@ -183,24 +157,24 @@ def test_damage_is_noticed(tmp_path, damage):
     path.write_bytes(content)
     if damage == "plain":  # of something else
         save_file({"weight": torch.ones(2)}, path)
-    with pytest.raises(ValueError, match=r"safetensors is not a readable policy.*Copy it again"):
+    with raises(ValueError, "model.safetensors"):
         load_policy(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "facts"),
     [
-        (lambda t, c: t.pop(ACTION), f"{ACTION} is missing"),
-        (lambda t, c: t.update({ACTION: torch.ones(9)}), rf"{ACTION} is \(9,\) of torch.float32, not"),
-        (lambda t, c: c["network"].update(name="evil:Net"), "unknown"),
-        (lambda t, c: c["actor"].update(nfe=0), "nfe"),
-        (lambda t, c: c.pop("prior"), "KeyError"),
+        (lambda t, c: t.pop(ACTION), [ACTION]),
+        (lambda t, c: t.update({ACTION: torch.ones(9)}), [ACTION, "(9,)"]),
+        (lambda t, c: c["network"].update(name="evil:Net"), ["evil:Net"]),
+        (lambda t, c: c["actor"].update(nfe=0), ["nfe", 0]),
+        (lambda t, c: c.pop("prior"), ["prior"]),
     ],
 )
-def test_parts_that_do_not_fit_each_other(tmp_path, change, said):
+def test_parts_that_do_not_fit_each_other(tmp_path, change, facts):
     saved(tmp_path)
     rewrite(tmp_path, change)
-    with pytest.raises(ValueError, match=f"the policy at .* cannot be built here: .*{said}|{said}"):
+    with raises(ValueError, tmp_path, *facts):
         load_policy(tmp_path)
 
 
@@ -212,7 +186,7 @@ def test_a_policy_that_is_loaded_is_finite(tmp_path, name, value):
     if name == WEIGHT and math.isfinite(value):
         load_policy(tmp_path)
         return
-    with pytest.raises(ValueError, match=f"the policy at {tmp_path} .*: {name} "):
+    with raises(ValueError, tmp_path, name):
         load_policy(tmp_path)
 
 
@@ -230,7 +204,7 @@ def test_a_policy_that_is_loaded_is_finite(tmp_path, name, value):
 def test_nothing_large_is_built_from_options_of_a_file(tmp_path, part, option, value):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config[part].update({option: value}))
-    with pytest.raises(ValueError, match=f"the policy at {tmp_path} cannot be built here"), Sizes() as sizes:
+    with raises(ValueError, tmp_path), Sizes() as sizes:
         load_policy(tmp_path)
     # As many numbers and tensors as an actor of this size takes, with room; 20,000 squared are 4e8.
     assert sizes.most < 2e7 and sizes.count < 10_000
@@ -252,18 +226,24 @@ def test_a_copy_of_the_configuration_that_differs_is_reported(tmp_path):
     actor = saved(tmp_path)
     copy = tmp_path / "config.json"
     copy.write_text(copy.read_text().replace("0.125", "0.5"))
-    with pytest.warns(UserWarning, match=r"config\.json differs in prior from .*model\.safetensors"):
+    with pytest.warns(UserWarning, match=r"config\.json.* prior .*model\.safetensors"):
         again = load_policy(tmp_path)
     assert again.prior.sigma == actor.prior.sigma == 0.125
     copy.unlink()
     load_policy(tmp_path)
 
 
-def test_only_regular_files_are_opened(tmp_path):
-    saved(tmp_path)
+def test_files_that_are_none(tmp_path):
+    with raises(FileNotFoundError, "nowhere", "model.safetensors"):
+        load_policy(tmp_path / "nowhere")
+    for version in (5, None, "7"):
+        saved(tmp_path)
+        rewrite(tmp_path, lambda tensors, config, version=version: config.update(format=version))
+        with raises(ValueError, "format", 7):
+            load_policy(tmp_path)
     (tmp_path / "model.safetensors").unlink()
     os.mkfifo(tmp_path / "model.safetensors")
-    with pytest.raises(ValueError, match="is not a regular file"):
+    with raises(ValueError, "regular file"):
         load_policy(tmp_path)
 
 

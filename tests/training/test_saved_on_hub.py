@@ -1,14 +1,13 @@
 """Policies at the hub, which a server on the loopback interface plays for the hub's own client."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.errors import raises
 from tests.io.hub_server import TOKEN, Repository, model_hub
-from tests.toy_env import random_history
-from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+from tests.toy_env import mlp_actor, random_history
+from warmprior import Normalizer, PastPrior
 from warmprior.training.saved import load_policy, policy_config, push_policy, save_policy
 
 pytest.importorskip("huggingface_hub")
@@ -26,18 +25,14 @@ def hub(monkeypatch, tmp_path):
 
 @pytest.fixture
 def actor():
-    torch.manual_seed(0)
     data = TensorDict({"observation": torch.randn(50, 5), "action": torch.randn(50, 2)}, [50])
-    network = VelocityMLP(2, 5, 3, 2, hidden_dim=16)
-    return WarmPriorActor(network, PastPrior(3), nfe=2, normalizer=Normalizer.fit(data)).eval()
+    return mlp_actor(PastPrior(3), observation_dim=5, nfe=2, normalizer=Normalizer.fit(data)).eval()
 
 
 def chunk(actor):
     generator = torch.Generator().manual_seed(1)
-    data = TensorDict(
-        {"observation": torch.randn(4, 2, 5, generator=generator), "history": random_history(actor.prior, 4)},
-        [4],
-    )
+    seen = torch.randn(4, 2, 5, generator=generator)
+    data = TensorDict({"observation": seen, "history": random_history(actor.prior, 4)}, [4])
     return actor(data, generator=generator)["vla_action", "chunk"]
 
 
@@ -56,51 +51,53 @@ def test_a_policy_goes_to_the_hub_and_back(hub, actor):
     again = load_policy(NAME)
     assert torch.equal(chunk(again), chunk(actor))
     assert policy_config(again) == policy_config(actor) and not again.training
+
     # The card is not needed here; what is here is not fetched again, nor the hub needed.
-    fetched = [r for r in hub.requests if r.startswith("GET") and "/resolve/" in r]
-    assert {r.rsplit("/", 1)[-1] for r in fetched} == FILES and len(fetched) == 2
-    before = len(hub.requests)
+    def fetched():
+        return [r for r in hub.requests if r.startswith("GET") and "/resolve/" in r]
+
+    assert {r.rsplit("/", 1)[-1] for r in fetched()} == FILES and len(fetched()) == 2
     load_policy(NAME)
-    assert not [r for r in hub.requests[before:] if r.startswith("GET") and "/resolve/" in r]
+    assert len(fetched()) == 2
     hub.close()
     assert torch.equal(chunk(load_policy(NAME)), chunk(actor))
 
 
 def test_revisions(hub, actor):
     first = push_policy(actor, NAME, token=TOKEN, card="first")
-    other = WarmPriorActor(VelocityMLP(2, 5, 3, 2, hidden_dim=16), PastPrior(3), nfe=2).eval()
+    other = mlp_actor(PastPrior(3), observation_dim=5, nfe=2, seed=1).eval()
     push_policy(other, NAME, token=TOKEN)
     assert hub.files(NAME)["README.md"] == b"first"  # without a card the old one stays
     push_policy(actor, NAME, token=TOKEN, revision="steady", message="a branch")
     for revision, mine in ((None, other), (first, actor), ("steady", actor)):
         again = load_policy(NAME, revision=revision)
         assert torch.equal(chunk(again), chunk(mine))
-    with pytest.raises(OSError, match="v9"):
+    with raises(OSError, "v9"):
         load_policy(NAME, revision="v9")
 
 
 def test_a_folder_is_a_folder(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept")
-    mine = WarmPriorActor(VelocityMLP(2, 5, 3, 2, hidden_dim=16), PastPrior(3), nfe=2).eval()
+    mine = mlp_actor(PastPrior(3), observation_dim=5, nfe=2, seed=1).eval()
     save_policy(mine, tmp_path / NAME)
     assert torch.equal(chunk(load_policy(NAME)), chunk(mine))
     for name in ("missing", "a/b/c", "../someone", f"{tmp_path}/missing", tmp_path / "missing"):
-        with pytest.raises(FileNotFoundError, match="no policy at"):
+        with raises(FileNotFoundError, "no policy"):
             load_policy(name)
-    with pytest.raises(ValueError, match=r"leave out revision='main'"):
+    with raises(ValueError, "revision='main'"):
         load_policy(NAME, revision="main")
     assert not hub.requests
 
 
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
-    with pytest.raises(ValueError, match=f"{NAME} is public"):
+    with raises(ValueError, NAME, "public"):
         push_policy(actor, NAME, token=TOKEN, private=True)
     assert not hub.files(NAME) and not hub.objects
 
 
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
-    with pytest.raises(ValueError, match=r"config\.json .*policy of warmprior"):
+    with raises(ValueError, "config.json"):
         load_policy(NAME)
     assert not [r for r in hub.requests if r.endswith("model.safetensors")]

@@ -1,7 +1,5 @@
 """A training step queues its work on the device and waits for nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,12 +1,9 @@
-"""From a task and a source to a trained policy: it continues, and depends on what it is given alone."""
-
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 
 from lab.tasks import navigation_task
+from tests.errors import raises
 from warmprior import ChiTransformer, PastPrior
 from warmprior.modules import PreconditionedNetwork
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -17,20 +14,12 @@ CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2
 
 
 def train(folder, prior=None, training=CONFIG, **options):
-    return train_policy(
-        navigation_task(),
-        prior or PastPrior(4),
-        folder,
-        network=NETWORK,
-        training=training,
-        description=None,
-        **options,
-    )
+    options |= {"network": NETWORK, "training": training, "description": None}
+    return train_policy(navigation_task(), prior or PastPrior(4), folder, **options)
 
 
 def equal(one, two):
-    pairs = zip(one.parameters(), two.parameters(), strict=True)
-    return all(torch.equal(a, b) for a, b in pairs)
+    return all(map(torch.equal, one.parameters(), two.parameters()))
 
 
 def test_what_is_done_before_makes_no_difference(tmp_path):
@@ -43,15 +32,14 @@ def test_what_is_done_before_makes_no_difference(tmp_path):
         assert torch.get_num_threads() == 1 + len(policies) - 1
         torch.set_num_threads(threads)
     assert equal(*policies) and next(policies[0].parameters()).device.type == "cpu"
-    assert not equal(policies[0], train(tmp_path / "other", training=TrainingConfig(
-        iterations=8, batch_size=16, checkpoints=1, seed=1
-    )))  # fmt: skip
+    other = TrainingConfig(iterations=8, batch_size=16, checkpoints=1, seed=1)
+    assert not equal(policies[0], train(tmp_path / "other", training=other))
 
 
 def test_what_does_not_exist_is_refused_with_what_does():
-    with pytest.raises(ValueError, match="style of the toy is 'toy' or 'position', got 'ph'"):
+    with raises(ValueError, "style", "'ph'"):
         navigation_task("ph")
-    with pytest.raises(ValueError, match=r"network must be one of mlp, plain_mlp, .*, got 'nonsense'"):
+    with raises(ValueError, "network", "mlp, plain_mlp", "'nonsense'"):
         NetworkOptions(network="nonsense")
 
 
@@ -69,17 +57,10 @@ def test_options_of_transformers_reach_them_alone(name, value):
     images = {"state": torch.zeros(5, 2, 3), "camera": torch.zeros(5, 2, 3, 10, 10, dtype=torch.uint8)}
     assert network(torch.rand(5), torch.randn(5, 4, 2), TensorDict(images, [5])).shape == (5, 4, 2)
     for network in ("mlp", "plain_mlp"):
-        said = f"{name} belongs to chi_transformer and adaln_transformer: leave it None with .* {network}$"
-        with pytest.raises(ValueError, match=said):
+        with raises(ValueError, name, "chi_transformer and adaln_transformer", network):
             NetworkOptions(network, **{name: value})
-    with pytest.raises(ValueError, match=f"{name} must be a .*, got -1"):
+    with raises(ValueError, name, -1):
         NetworkOptions("chi_transformer", **{name: -1})
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_norm_that_no_gradient_can_have_is_refused(value):
-    with pytest.raises(ValueError, match="max_grad_norm must be a finite number > 0"):
-        TrainingConfig(max_grad_norm=value)
 
 
 def test_a_fresh_policy_has_the_parts_that_were_asked_for():

@@ -1,7 +1,3 @@
-"""The pictures are of the very episode that was evaluated."""
-
-from __future__ import annotations
-
 from typing import ClassVar
 
 import gymnasium
@@ -10,6 +6,7 @@ import pytest
 import torch
 
 from tests.envs.test_gymnasium import Dial
+from tests.errors import raises
 from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import play_episode, record_filmstrip
 
@@ -78,5 +75,5 @@ def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypa
         stream = container.streams.video[0]
         assert (stream.average_rate, stream.frames) == (5, 5)
     bare = environment_of(actor)
-    with pytest.raises(ValueError, match="render_mode"):
+    with raises(ValueError, "render_mode"):
         record_filmstrip(actor, seed=0, frames=2, env=bare)
