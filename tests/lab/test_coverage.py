@@ -1,8 +1,7 @@
 """Coverage of sources, where the share of targets inside is known."""
 
-from __future__ import annotations
-
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,13 +9,14 @@ import torch
 from lab.learned_sources import CVAEPrior
 from lab.source_errors import source_coverage
 from tests.diagnostics.fields import D_A, H, remember, targets
-from warmprior import PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
+from tests.errors import raises
+from tests.toy_env import mlp_actor
+from warmprior import PastPrior, PreviewPrior
 
 N = 20_000
 
 
-def actor(prior):
-    return WarmPriorActor(VelocityMLP(D_A, 4, prior.prediction_length, 1, hidden_dim=4), prior)
+actor = partial(mlp_actor, steps=1)
 
 
 def windows(prior, spread):
@@ -48,5 +48,5 @@ def test_only_executed_positions_inside_the_episode_count():
 def test_what_is_no_gaussian_has_none():
     prior = CVAEPrior(H, widths=[D_A, 4, 1])
     assert math.isnan(source_coverage(actor(prior), windows(prior, 1.0)))
-    with pytest.raises(ValueError, match=r"level must be in \(0, 1\)"):
+    with raises(ValueError, "level", 1.0):
         source_coverage(actor(PastPrior(H)), windows(PastPrior(H), 1.0), level=1.0)

@@ -1,13 +1,11 @@
-from __future__ import annotations
-
-import hashlib
 from collections import Counter
 
 import pytest
 
 from lab.downloads import REPOSITORIES, download_robomimic
 from tests.data.synthetic import write_robomimic_file
-from tests.io.hub_server import Loopback, reachable
+from tests.errors import raises
+from tests.io.hub_server import Loopback, etag, reachable
 
 pytest.importorskip("huggingface_hub")
 
@@ -16,45 +14,22 @@ FILE = "v1.5/square/ph/low_dim_v15.hdf5"
 
 
 class Hub(Loopback):
-    """A server on the loopback interface that answers as the hub's file addresses do.
+    """``files`` maps (repository, path) to (announced length, body); some repositories send another one."""
 
-    ``files`` maps (repository, path) to (announced length, body); ``missing`` is the error code for
-    everything else.
-    """
-
-    def __init__(self) -> None:
-        self.files: dict[tuple[str, str], tuple[int, bytes]] = {}
-        self.missing = "RepoNotFound"
-        self.sent: dict[str, bytes] = {}  # by repository, instead of what is announced
-        self.requests: Counter[tuple[str, str]] = Counter()
+    def __init__(self):
+        self.files, self.sent, self.requests = {}, {}, Counter()
         super().__init__()
 
-    def answer(self, request) -> None:
-        parts = request.path.split("/resolve/main/")
-        repository = parts[0].removeprefix("/datasets/")
-        self.requests[request.command, repository] += 1
-        found = self.files.get((repository, parts[-1]))
-        if found is None:
-            request.send_response(404)
-            request.send_header("X-Error-Code", self.missing)
-            request.send_header("X-Repo-Commit", "b" * 40)
-            request.send_header("Content-Length", "0")
-            request.end_headers()
-            return
-        body = request.command == "GET"
-        announced, content = found
-        digest = hashlib.sha256(content).hexdigest()
-        content = self.sent.get(repository, content)
-        request.send_response(200)
-        request.send_header("ETag", f'"{digest}"')
-        request.send_header("X-Repo-Commit", "a" * 40)
-        request.send_header("X-Linked-Size", str(announced))
-        request.send_header("Content-Length", str(len(content)))
-        request.end_headers()
-        if body:
-            request.wfile.write(content)
+    def answer(self, method, path, body, allowed):
+        repository, _, file = path.removeprefix("/datasets/").partition("/resolve/main/")
+        self.requests[method, repository] += 1
+        if (repository, file) not in self.files:
+            return 404, {"X-Error-Code": "RepoNotFound"}, b""
+        announced, content = self.files[repository, file]
+        headers = {"ETag": f'"{etag(content)}"', "X-Linked-Size": str(announced), "X-Repo-Commit": "a" * 40}
+        return 200, headers, self.sent.get(repository, content)
 
-    def put(self, repository: str, content: bytes, announced: int | None = None) -> None:
+    def put(self, repository, content, announced=None):
         self.files[repository, FILE] = (announced or len(content), content)
 
 
@@ -67,7 +42,7 @@ def hub(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def content(tmp_path_factory) -> bytes:
+def content(tmp_path_factory):
     path = tmp_path_factory.mktemp("hub") / "file.hdf5"
     write_robomimic_file(path)
     return path.read_bytes()
@@ -85,22 +60,22 @@ def test_is_fetched_once(hub, content, tmp_path):
 
 
 BROKEN = {
-    "shorter than announced": (lambda content: content[:-5000], True, "should be of size"),
-    "cut short at the source": (lambda content: content[:-5000], False, "not a readable HDF5 file"),
+    "shorter than announced": (lambda content: content[:-5000], True, "size"),
+    "cut short at the source": (lambda content: content[:-5000], False, "HDF5"),
     "damaged on the way": (lambda content: content[:-100] + b"?" + content[-99:], None, "sha256"),
 }
 
 
 @pytest.mark.parametrize("kind", BROKEN)
 def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp_path, kind):
-    change, announced, said = BROKEN[kind]
+    change, announced, fact = BROKEN[kind]
     for repository in REPOSITORIES:
         if announced is None:
             hub.put(repository, content)
             hub.sent[repository] = change(content)
         else:
             hub.put(repository, change(content), len(content) if announced else None)
-    with pytest.raises(OSError, match=rf"(?s){said}.*force=True"):
+    with raises(OSError, fact, "force=True"):
         download_robomimic("square", root=tmp_path)
     hub.sent = {}
     hub.put(FIRST, content)
@@ -111,14 +86,14 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
 
 
 @pytest.mark.parametrize(
-    ("args", "said"),
+    ("args", "there"),
     [
-        (["stack"], "choose one of lift, can, square, transport, tool_hang, stack_d0"),
-        (["lift", "mg"], "'mg' data; it has: ph, mh"),
-        (["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
+        (["stack"], "lift, can, square, transport, tool_hang, stack_d0"),
+        (["lift", "mg"], "ph, mh"),
+        (["coffee_d0", "ph"], "source, core"),
     ],
 )
-def test_unknown_task_or_style_asks_nobody(hub, args, said):
-    with pytest.raises(ValueError, match=said):
+def test_unknown_task_or_style_asks_nobody(hub, args, there):
+    with raises(ValueError, f"'{args[-1]}'", there):
         download_robomimic(*args)
     assert not hub.requests

@@ -1,7 +1,3 @@
-"""Errors of the mean, against sums written out by hand."""
-
-from __future__ import annotations
-
 import math
 
 import pytest

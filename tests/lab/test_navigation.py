@@ -1,7 +1,5 @@
 """The toy shows what the paper says it shows (Sec. 5.2, Fig. 5)."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -31,26 +29,12 @@ def trained(tmp_path_factory):
 
     def train(name, iterations, seed=1):
         make, options, recipe = SOURCES[name]
-        training = TrainingConfig(
-            iterations=iterations,
-            batch_size=256,
-            learning_rate=2e-3,
-            warmup_ratio=0.0,
-            checkpoints=1,
-            save_every=iterations,
-            cold_probability=0.1 if name in ("history", "past", "wide", "preview") else 0.0,
-            seed=seed,
-            **recipe,
-        )
-        return train_policy(
-            navigation_task(),
-            make(),
-            folder / f"{name}-{iterations}-{seed}",
-            network=NetworkOptions(hidden_dim=128, observation_steps=1),
-            training=training,
-            description=None,
-            **options,
-        )
+        recipe |= {"iterations": iterations, "save_every": iterations, "checkpoints": 1, "seed": seed}
+        recipe |= {"batch_size": 256, "learning_rate": 2e-3, "warmup_ratio": 0.0}
+        recipe["cold_probability"] = 0.0 if name in ("gaussian", "regression") else 0.1
+        options |= {"network": NetworkOptions(hidden_dim=128, observation_steps=1), "description": None}
+        out = folder / f"{name}-{iterations}-{seed}"
+        return train_policy(navigation_task(), make(), out, training=TrainingConfig(**recipe), **options)
 
     return train
 

@@ -1,7 +1,5 @@
 """A Ray cluster: what is none, and machines that could not do the work, are refused at once."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import sys
@@ -11,6 +9,7 @@ import pytest
 
 from lab import ray_cluster as module
 from lab.ray_cluster import check_ray, ray_cluster
+from tests.errors import raises
 from tests.processes import apart
 
 pytest.importorskip("ray")
@@ -39,8 +38,7 @@ def test_a_cluster_of_this_machine_alone_is_reached_from_no_other(monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     with ray_cluster(num_cpus=1) as ray:
         assert ray.get(ray.remote(lambda: 42).remote()) == 42
-        me = psutil.Process()
-        listening = {}
+        me, listening = psutil.Process(), {}
         for process in (me, *me.children(recursive=True)):
             with contextlib.suppress(psutil.Error):
                 for socket_ in process.net_connections(kind="inet"):
@@ -52,16 +50,16 @@ def test_a_cluster_of_this_machine_alone_is_reached_from_no_other(monkeypatch):
 
 def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
     started = time.monotonic()
-    with pytest.raises(ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"):
+    with raises(ConnectionError, "127.0.0.1:1", "ray start --head"):
         check_ray("127.0.0.1:1")
     for address in ("localhost", "ray://head:10001"):
-        with pytest.raises(ValueError, match="HOST:PORT"):
+        with raises(ValueError, "HOST:PORT"):
             check_ray(address)
     assert time.monotonic() - started < 5
     monkeypatch.setattr(module, "PATIENCE", 3.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
-        with pytest.raises(ConnectionError, match="does not answer within 3 seconds"):
+        with raises(ConnectionError, "3 seconds"):
             check_ray()
     monkeypatch.delenv("RAY_ADDRESS")
     assert check_ray() is None
@@ -70,5 +68,5 @@ def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     for attempt in (check_ray, lambda: ray_cluster().__enter__()):
-        with pytest.raises(ImportError, match=r"ray is not installed.*warmprior\[ray\]"):
+        with raises(ImportError, "warmprior[ray]"):
             attempt()

@@ -1,7 +1,5 @@
 """Collection by actors of a Ray cluster: the same kind of transitions, and learning from them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -11,6 +9,7 @@ from functools import partial
 from lab.ray_collection import ray_rounds
 from tests.processes import apart
 from tests.rl.training_parts import LENGTHS, H, check_transitions, make_actor, make_env, make_training
+from tests.states import copied, same
 from warmprior import PastPrior
 from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import PriorSpaceAgent, WarmUpSwitch
@@ -34,13 +33,9 @@ def test_a_buffer_says_which_policy_acts():
 @apart
 def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
-    training = make_training(
-        tmp_path,
-        actor,
-        warmup_steps=40,
-        collection={"collect": partial(ray_rounds, collectors=2, address=ray_address)},
-    )
-    fresh = {name: value.clone() for name, value in training.agent.state().items()}
+    collect = partial(ray_rounds, collectors=2, address=ray_address)
+    training = make_training(tmp_path, actor, warmup_steps=40, collection={"collect": collect})
+    fresh = copied(training.agent.state())
     training.run()
     lengths = LENGTHS * 2
     check_transitions(training, lengths=lengths)
@@ -53,7 +48,6 @@ def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp
     # No two actors draw alike.
     rounds = drawn.unflatten(0, (-1, 2, 2))
     assert not torch.isclose(rounds[:, 0], rounds[:, 1]).all(-1).any()
-    state = training.agent.state()
-    assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
+    assert not same(fresh, training.agent.state())
     again = make_training(tmp_path, actor, warmup_steps=40)
     assert again.steps == training.steps and again.curve == training.curve

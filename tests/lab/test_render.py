@@ -1,7 +1,3 @@
-"""Images made of the states of demonstrations."""
-
-from __future__ import annotations
-
 import errno
 import shutil
 from functools import partial
@@ -19,6 +15,7 @@ import h5py
 
 from lab import render as render_module
 from lab.render import render_demonstrations
+from tests.errors import raises
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import DatasetError, RobomimicDemonstrations
@@ -80,17 +77,11 @@ def picture(rendered, tmp_path):
 
 def images_of(path):
     with h5py.File(path) as file:
-        return {
-            f"{name}/{key}": demo["obs"][key][:]
-            for name, demo in file["data"].items()
-            for key in demo["obs"]
-            if key.endswith("_image")
-        }
+        return {f"{name}/{key}": demo["obs"][key][:] for name, demo in file["data"].items() for key in IMAGES}
 
 
 @apart
 def replayed(path):
-    """Images and observations of a file's states, by the environment."""
     env = RobosuiteEnv("lift", camera_size=16, fast_rendering=True)
     env.reset()
     found = {}
@@ -111,7 +102,6 @@ def replayed(path):
 
 def test_images_are_those_of_the_recorded_states(recorded, rendered):
     images, expected = images_of(rendered), replayed(recorded)
-    assert len(images) == 4
     for name, value in images.items():
         np.testing.assert_array_equal(value, expected[name])
     with h5py.File(recorded) as file:
@@ -144,23 +134,20 @@ def test_images_do_not_depend_on_the_number_of_workers(recorded, rendered, tmp_p
         np.testing.assert_array_equal(value, expected[name])
 
 
-def full(path, write):
-    raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-
 @pytest.mark.slow
 def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
     """And is not rendered again; what was there before stays until the new file is complete."""
     before = copy.read_bytes()
-    with monkeypatch.context() as patch:
-        real = render_module.write_atomic
-        patch.setattr(
-            render_module,
-            "write_atomic",
-            lambda path, write: real(path, write) if "demo_0" in path.name else full(path, write),
-        )
-        with pytest.raises(OSError, match="No space left"):
-            render(copy, CAMERAS, out=copy)
+    write_atomic = render_module.write_atomic
+
+    def full(path, write):
+        if "demo_0" not in path.name:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_atomic(path, write)
+
+    with monkeypatch.context() as patch, raises(OSError, "No space left"):
+        patch.setattr(render_module, "write_atomic", full)
+        render(copy, CAMERAS, out=copy)
     assert copy.read_bytes() == before
     (part,) = copy.parent.glob("*.parts/demo_0.npz")
     with np.load(part) as images:
@@ -175,7 +162,7 @@ def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
 
 
 def test_images_beyond_any_memory_are_refused(copy):
-    with pytest.raises(ValueError, match="size 1000000000 is too large"):
+    with raises(ValueError, "1000000000"):
         render_demonstrations(copy, CAMERAS, 10**9)
     assert not list(copy.parent.glob("*.hdf5.*"))
 
@@ -190,16 +177,13 @@ def not_a_number(file):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (not_a_number, "states has NaN or infinity in row 2"),
-        (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
-    ],
+    ("change", "facts"),
+    [(not_a_number, ("NaN", "row 2")), (of_another_environment, ("(4, 45)", "Lift", "(4, 32)"))],
 )
-def test_states_that_cannot_be_rendered_are_refused(copy, change, said):
+def test_states_that_cannot_be_rendered_are_refused(copy, change, facts):
     with h5py.File(copy, "a") as file:
         change(file)
-    with pytest.raises(DatasetError, match=said):
+    with raises(DatasetError, "states", *facts):
         render(copy, CAMERAS[:1], out=copy)
     assert not list(copy.parent.glob("*.hdf5.*/*"))
 
@@ -213,19 +197,19 @@ def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "facts"),
     [
-        (lambda images: images / 255, r"type float64; images are uint8"),
-        (lambda images: images[..., :2], r"\(4, 16, 16, 2\).*images are uint8"),
-        (lambda images: images[:3], r"\(3, 16, 16, 3\).*\(4, side"),
-        (lambda images: images[:, :8], r"\(4, 8, 16, 3\).*side, side"),
-        (lambda images: images[:, :8, :8], "obs/agentview_image.* 16: .*render them again"),
-        (None, "no images 'agentview_image'; .*robot0_eye_in_hand_image"),
+        (lambda images: images / 255, ("float64", "uint8")),
+        (lambda images: images[..., :2], ("(4, 16, 16, 2)", "uint8")),
+        (lambda images: images[:3], ("(3, 16, 16, 3)", "(4, side")),
+        (lambda images: images[:, :8], ("(4, 8, 16, 3)", "side, side")),
+        (lambda images: images[:, :8, :8], ("obs/agentview_image", 16)),
+        (None, ("'agentview_image'", "robot0_eye_in_hand_image")),
     ],
 )
-def test_images_of_another_kind_are_refused(picture, value, said):
+def test_images_of_another_kind_are_refused(picture, value, facts):
     replaced(picture, value)
-    with pytest.raises(DatasetError, match=rf"data/demo_1.*{said}"):
+    with raises(DatasetError, "data/demo_1", *facts):
         RobomimicDemonstrations(picture, image_keys=IMAGES)
 
 
@@ -235,30 +219,26 @@ def test_images_upside_down_are_refused(picture):
     found = Demonstrations(picture)
     compare = partial(found.with_images, CAMERAS, 16, demos=None)
     compare(fast=True)
-    with pytest.raises(DatasetError, match=r"rendered fast.*add --fast-rendering"):
+    with raises(DatasetError, "--fast-rendering"):
         compare(fast=False)
     changes = {
-        "are upside down": lambda images: images[:, ::-1],
-        "have red and blue exchanged": lambda images: images[..., ::-1],
-        "show something else": lambda images: 255 - images,
+        "upside down": lambda images: images[:, ::-1],
+        "red and blue": lambda images: images[..., ::-1],
+        "something else": lambda images: 255 - images,
     }
     with h5py.File(picture) as file:
         before = file[key][()]
-    for message, change in changes.items():
+    for fact, change in changes.items():
         replaced(picture, lambda images, change=change: change(before), key)
-        with pytest.raises(DatasetError, match=f"images of agentview {message}"):
+        with raises(DatasetError, "agentview", fact):
             compare(fast=True)
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
-    dataset = RobomimicDemonstrations(
-        rendered,
-        observation_keys=["robot0_eef_pos"],
-        image_keys=IMAGES,
-        storage=storage,
-        scratch_dir=tmp_path if storage == "memmap" else None,
-    )
+    seen = {"observation_keys": ["robot0_eef_pos"], "image_keys": IMAGES}
+    place = {"storage": storage, "scratch_dir": tmp_path if storage == "memmap" else None}
+    dataset = RobomimicDemonstrations(rendered, **seen, **place)
     assert dataset.image_size == 16
     buffer = window_replay_buffer(dataset.data, PastPrior(2), batch_size=32, observation_steps=2)
     stored = images_of(rendered)

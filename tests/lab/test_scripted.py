@@ -1,7 +1,3 @@
-"""Scripted experts and the demonstration files they fill."""
-
-from __future__ import annotations
-
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +17,7 @@ from lab.scripted import generate as generate_module
 from lab.scripted.episode import Episode, expert_loop, operator_of, run_episode, write_robomimic
 from lab.scripted.generate import generate_demonstrations
 from lab.scripted.motion import CLOSED, transfer
+from tests.errors import raises
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import TASKS
 
@@ -48,6 +45,11 @@ def test_the_number_of_workers_does_not_matter(lift_demonstrations, tmp_path):
         np.testing.assert_array_equal(value, second[name], err_msg=name)
 
 
+def masks_of(path):
+    with h5py.File(path) as file:
+        return {key: {name.decode() for name in names[()]} for key, names in file["mask"].items()}
+
+
 def test_layout_is_robomimics(lift_demonstrations):
     with h5py.File(lift_demonstrations) as file:
         data = file["data"]
@@ -55,8 +57,7 @@ def test_layout_is_robomimics(lift_demonstrations):
         assert demos == ["demo_0", "demo_1", "demo_2"]
         assert data.attrs["total"] == sum(data[name].attrs["num_samples"] for name in demos)
         env_args = json.loads(data.attrs["env_args"])
-        assert env_args["env_name"] == "Lift"
-        assert env_args["type"] == 1
+        assert (env_args["env_name"], env_args["type"]) == ("Lift", 1)
         arm = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
         assert (arm["input_type"], arm["input_ref_frame"]) == ("delta", "world")
         for name in demos:
@@ -66,20 +67,17 @@ def test_layout_is_robomimics(lift_demonstrations):
             assert json.loads(demo.attrs["ep_meta"]) == {}
             shapes = {"actions": (steps, 7), "states": (steps, 32), "rewards": (steps,)}
             for key, shape in shapes.items():
-                assert demo[key].shape == shape
-                assert demo[key].dtype == np.float64
-            assert demo["dones"].dtype == np.int64
-            assert np.abs(demo["actions"][()]).max() <= 1
+                assert (demo[key].shape, demo[key].dtype) == (shape, np.float64)
+            assert demo["dones"].dtype == np.int64 and np.abs(demo["actions"][()]).max() <= 1
             rewards, dones = demo["rewards"][()], demo["dones"][()]
-            assert rewards[-1] == 1
-            assert dones[-1] == 1
+            assert rewards[-1] == dones[-1] == 1
             np.testing.assert_array_equal(dones[:-1], rewards[:-1] == 1)
             assert set(demo["obs"]) == set(demo["next_obs"]) >= set(TASKS["lift"].low_dim_keys)
             for key in demo["obs"]:
                 here, after = demo["obs"][key][()], demo["next_obs"][key][()]
                 assert here.dtype == np.float64
                 np.testing.assert_array_equal(here[1:], after[:-1], err_msg=key)
-        masks = {key: {name.decode() for name in file["mask"][key][()]} for key in file["mask"]}
+    masks = masks_of(lift_demonstrations)
     assert masks["train"] | masks["valid"] == set(demos)
     assert not masks["train"] & masks["valid"]
     assert {"20_percent", "50_percent"} <= masks.keys()
@@ -126,18 +124,18 @@ def in_threads(count, state):
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "message"),
+    ("options", "facts"),
     [
-        ("tool_hang", {}, "no scripted expert for 'tool_hang'.*download_robomimic"),
-        ("lift", {"style": "mg"}, "style is 'ph' or 'mh', got 'mg'"),
-        ("lift", {"seed": 100}, "seed must be between 0 and 99, got 100"),
-        ("lift", {"n": 10**23}, "n must be at most 100,000"),
+        ({"task": "tool_hang"}, ("'tool_hang'", "download_robomimic")),
+        ({"style": "mg"}, ("style", "'mg'")),
+        ({"seed": 100}, ("seed", 99, 100)),
+        ({"n": 10**23}, ("n", "100,000")),
     ],
 )
-def test_bad_arguments(task, options, message, tmp_path, monkeypatch):
+def test_bad_arguments(options, facts, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
-    with pytest.raises(ValueError, match=message):
-        generate_demonstrations(task, **options)
+    with raises(ValueError, *facts):
+        generate_demonstrations(**{"task": "lift"} | options)
     assert not list(tmp_path.iterdir())
 
 
@@ -149,7 +147,6 @@ def fake_episode(seed, style="mh", success=True):
 
 
 def generated(monkeypatch, path, run_episode, **options):
-    """The demonstrations that would be written, of episodes that are made up."""
     kept = []
 
     def write(path, episodes, **facts):
@@ -169,7 +166,7 @@ def test_a_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
 
     path = tmp_path / "mine.hdf5"
     path.write_bytes(b"mine")
-    with pytest.raises(FileExistsError, match=r"mine\.hdf5 exists: .*--overwrite"):
+    with raises(FileExistsError, "mine.hdf5", "--overwrite"):
         generated(monkeypatch, path, run_episode, style="mh", n=6)
     kept = generated(monkeypatch, path, run_episode, style="mh", n=6, overwrite=True)
     assert len(kept) == 6
@@ -194,8 +191,7 @@ def test_filter_keys_of_several_operators(tmp_path):
     path = tmp_path / "mh.hdf5"
     episodes = [fake_episode(seed) for seed in range(12)]
     assert write_robomimic(path, episodes, env_args={}, model_file="<mujoco/>") == 48
-    with h5py.File(path) as file:
-        masks = {key: {name.decode() for name in file["mask"][key][()]} for key in file["mask"]}
+    masks = masks_of(path)
     everything = {f"demo_{i}" for i in range(12)}
     assert masks["better"] == {"demo_0", "demo_1", "demo_6", "demo_7"}
     assert masks["better"] | masks["okay"] | masks["worse"] == everything

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -8,12 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.statistics import (
-    bootstrap_ratio,
-    chosen_elsewhere,
-    paired_probability_better,
-    probability_better,
-)
+from lab.statistics import bootstrap_ratio, chosen_elsewhere, paired_probability_better, probability_better
+from tests.errors import raises
 
 rates = st.lists(st.floats(0, 1), min_size=1, max_size=8)
 
@@ -64,7 +58,7 @@ def test_paired_probability_is_that_of_a_beta(wins, losses):
     found = paired_probability_better(wins, losses)
     assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
     assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
-    with pytest.raises(ValueError, match="between 0"):
+    with raises(ValueError, "between 0"):
         paired_probability_better(-1, losses)
 
 
