@@ -1,23 +1,24 @@
 """One tiny policy per family, built once: most of the time is the import of LeRobot."""
 
-from __future__ import annotations
-
 import os
 
 import pytest
 import torch
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+pytest.importorskip("lerobot")
+pytest.importorskip("transformers")
+
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from tests.lerobot.tiny import MAKERS
 
 collect_ignore = ["robot"]  # a package of LeRobot's, for other processes
 
 
 @pytest.fixture(scope="session")
 def built():
-    pytest.importorskip("lerobot")
-    pytest.importorskip("transformers")
-    from tests.lerobot.tiny import MAKERS
-
     policies = {}
 
     def build(family, **options):
@@ -48,10 +49,6 @@ def policy(built):
 @pytest.fixture(scope="session")
 def found():
     """The policies' classes, by LeRobot's own discovery."""
-    pytest.importorskip("lerobot_policy_warmprior")
-    pytest.importorskip("transformers")
-    from lerobot.policies.factory import get_policy_class
-    from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
     names = ("warm_smolvla", "warm_pi05", "warm_groot", "warm_flow")

@@ -1,7 +1,3 @@
-"""What the network inside of a LeRobot policy is given and gives, call by call."""
-
-from __future__ import annotations
-
 from contextlib import contextmanager
 from typing import Any
 

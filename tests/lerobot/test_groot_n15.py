@@ -1,21 +1,16 @@
 """What is peculiar to GR00T N1.5; the rest is tested as for all families (``make test-groot-n15``)."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
+from tests.errors import raises
 from tests.lerobot.seen import at_times, watch
-from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations
+from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, generator, observations
 from warmprior import PastPrior, PreviewPrior
 from warmprior.lerobot import WarmPriorAdapter
 
 if not N15:
     pytest.skip("needs lerobot 0.5.1: make test-groot-n15", allow_module_level=True)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def integrated(seen):
@@ -82,5 +77,5 @@ def test_history_through_the_preprocessor(policy, preprocessed):
         torch.testing.assert_close(seen.x[0][..., :ACTION], expected)
     # It keeps the first actions of a longer window, which are the history.
     cut = {**observations("groot", 3), **preprocess(raw), "action_is_pad": is_pad}
-    with pytest.raises(ValueError, match=r"'action': 8\} actions, expected \{'action': 16"):
+    with raises(ValueError, "{'action': 8}", "{'action': 16"):
         adapter.loss(cut)

@@ -1,7 +1,3 @@
-"""Histories of batches that no environment keeps, by hand."""
-
-from __future__ import annotations
-
 import torch
 
 from warmprior import PreviewPrior
@@ -16,12 +12,10 @@ def chunk(first, length, size=2):
 
 
 def row(history, i=0):
-    """Actions, steps, forecast and its steps of one row."""
     return [history[name][i].flatten().tolist() for name in ENTRIES]
 
 
 def executing(prior, count, first=1):
-    """A memory that executed ``count`` actions of its first chunk."""
     memory = ActionMemory(prior, 1)
     memory.decide(2)
     memory.record(chunk(first, prior.prediction_length))

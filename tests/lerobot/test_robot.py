@@ -1,7 +1,5 @@
 """LeRobot's policies on a robot: in the executor, and in LeRobot's own loop with a robot of a package."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -12,18 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.errors import raises
 from tests.lerobot.test_actor import preprocessed
 from tests.lerobot.test_plugin import warm
-from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
+from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE, features
+from tests.toy_env import stirred
 from warmprior import PastPrior, RealTimeChunking
 from warmprior.deploy import AsyncExecutor
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
-
-pytest.importorskip("lerobot")
-pytest.importorskip("lerobot_policy_warmprior")
-pytest.importorskip("transformers")
-
-from lerobot.configs.types import FeatureType, PolicyFeature
 
 ROBOT = Path(__file__).parent / "robot"
 
@@ -58,7 +52,7 @@ def test_a_warm_policy_acts_as_its_own_loop_does(found, name):
         torch.manual_seed(1)
         found_actions = torch.stack([executor.act(observation) for observation in seen])
         assert executor.execute == LENGTH
-        with pytest.raises(KeyError, match="top"):
+        with raises(KeyError, "top"):
             executor.act({"state": np.zeros(STATE)})
     assert found_actions.shape == (2 * LENGTH + 1, ACTION)
     torch.testing.assert_close(found_actions, torch.stack(expected))
@@ -68,10 +62,10 @@ def test_an_adapter_brings_policy_and_prior(policy):
     made, prior = policy("smolvla"), PastPrior(LENGTH)
     actor = LeRobotActor(WarmPriorAdapter(made, prior, nfe=2), preprocess=preprocessed)
     assert actor.prior is prior and actor.sampling.nfe == 2 and actor.ode.policy is made
-    with pytest.raises(ValueError, match="prior"):
+    with raises(ValueError, "prior"):
         LeRobotActor(made)
     guided = WarmPriorAdapter(policy("smolvla", n_action_steps=2), prior, guidance=RealTimeChunking())
-    with pytest.raises(ValueError, match="guidance"):
+    with raises(ValueError, "guidance"):
         LeRobotActor(guided)
 
 
@@ -88,27 +82,15 @@ def test_a_warm_flow_policy_acts_by_its_averaged_weights(found, tmp_path, camera
     from lerobot_policy_warmprior.robot import load_actor
 
     kind, side = found["warm_flow"], 32
-    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(STATE,))}
-    if camera:
-        inputs[CAMERA] = PolicyFeature(type=FeatureType.VISUAL, shape=(3, side, side))
-    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "device": "cpu"}
-    config = kind.config_class(
-        input_features=inputs,
-        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))},
-        precondition=False,
-        nfe=2,
-        image_size=side,
-        crop_size=28,
-        **small,
-    )
+    named = features((3, side, side) if camera else None)
+    named["output_features"]["action"].shape = (2,)
+    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
+    config = kind.config_class(precondition=False, image_size=side, crop_size=28, **small, **named)
     torch.manual_seed(0)
     policy = kind(config)
-    with torch.no_grad():
-        for weight in policy.actor.network.parameters():
-            weight.add_(0.05 * torch.randn_like(weight))
-        policy.update()
-        for weight in policy.actor.network.parameters():
-            weight.add_(0.5)
+    stirred(policy.actor.network, by=0.05)
+    policy.update()
+    stirred(policy.actor.network, by=0.5)
     policy.save_pretrained(tmp_path)
     stats = {name: {end: torch.tensor(v).float() for end, v in of.items()} for name, of in STATS.items()}
     before, after = make_warm_flow_pre_post_processors(config, stats)
@@ -142,9 +124,8 @@ def test_a_saved_vla_is_loaded_with_its_processors(found, tmp_path, monkeypatch)
         return preprocessed({key: value.float() for key, value in batch.items()})
 
     # The tokeniser of LeRobot's is on the hub, and so is the backbone's configuration.
-    monkeypatch.setattr(
-        robot, "make_pre_post_processors", lambda *args, **options: (before, lambda a: a + 100)
-    )
+    pipelines = before, lambda action: action + 100
+    monkeypatch.setattr(robot, "make_pre_post_processors", lambda *args, **options: pipelines)
     monkeypatch.setattr(type(policy), "from_pretrained", classmethod(lambda kind, *args, **options: policy))
     with AsyncExecutor(robot.load_actor(tmp_path, task="wave"), latency=0) as executor:
         action = executor.act(next(iter(observations(1, 64))))

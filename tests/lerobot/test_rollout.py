@@ -1,19 +1,13 @@
 """The plugin's policies where LeRobot's real-time chunking replans before a chunk is used up."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-
-from tests.lerobot.test_plugin import VLA, warm
-from tests.lerobot.tiny import ACTION, LENGTH, observations
-
-pytest.importorskip("lerobot")
-pytest.importorskip("lerobot_policy_warmprior")
-pytest.importorskip("transformers")
-
 from lerobot.policies.rtc import ActionQueue, RTCConfig
 from lerobot.rollout.inference.rtc import _normalize_prev_actions_length, supports_rtc_inference
+
+from tests.errors import raises
+from tests.lerobot.test_plugin import VLA, warm
+from tests.lerobot.tiny import ACTION, LENGTH, observations
 
 
 def rollout(policy, family, plan, horizon):
@@ -75,15 +69,15 @@ def test_what_is_left_over_must_be_of_the_last_chunk(found):
     policy.reset()
     batch = observations("pi05", 2)
     chunk = policy.predict_action_chunk(dict(batch), inference_delay=0, prev_chunk_left_over=None)
-    with pytest.raises(ValueError, match=r"prev_chunk_left_over.*executed_steps="):
+    with raises(ValueError, "prev_chunk_left_over", "executed_steps="):
         policy.predict_action_chunk(dict(batch), inference_delay=1, prev_chunk_left_over=chunk[:, 2:5] + 1)
-    with pytest.raises(ValueError, match=r"executed_steps=.*prev_chunk_left_over"):
+    with raises(ValueError, "executed_steps=", "prev_chunk_left_over"):
         policy.predict_action_chunk(dict(batch))
     policy.predict_action_chunk(dict(batch), inference_delay=1, prev_chunk_left_over=chunk[:, LENGTH:])
-    with pytest.raises(TypeError, match="takes no executed_step,"):
+    with raises(TypeError, "executed_step,"):
         policy.predict_action_chunk(dict(batch), executed_steps=1, **{"executed_step,": 2})
     policy.config.rtc_config = RTCConfig(enabled=False)
-    with pytest.raises(ValueError, match=r"rtc\.enabled=false"):
+    with raises(ValueError, "rtc.enabled=false"):
         policy.predict_action_chunk(dict(batch), inference_delay=1, prev_chunk_left_over=chunk[:, 2:5])
 
 

@@ -1,7 +1,5 @@
 """LeRobot's own flow policies with random weights, small and without a hub."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 from importlib.metadata import PackageNotFoundError, version
@@ -26,13 +24,11 @@ def installed() -> str | None:
 N15 = installed() == "0.5.1"
 """Whether the release is that of GR00T N1.5, where no other family is supported (``make test-groot-n15``)."""
 
-ATTENTION = {  # of the heads of GR00T
-    "positional_embeddings": None,
-    "num_attention_heads": 2,
-    "attention_head_dim": 16,
-    "dropout": 0.0,
-    "final_dropout": False,
-}
+# Of the heads of GR00T.
+ATTENTION = {"positional_embeddings": None, "num_attention_heads": 2, "attention_head_dim": 16}
+ATTENTION |= {"dropout": 0.0, "final_dropout": False}
+DIFFUSION = {**ATTENTION, "norm_type": "ada_norm", "output_dim": 32, "interleave_self_attention": True}
+WIDTHS = {"input_embedding_dim": 32, "backbone_embedding_dim": 32, "hidden_size": 32}
 
 
 def features(image: tuple[int, ...] | None = (3, 64, 64)) -> dict[str, Any]:
@@ -50,15 +46,8 @@ def make_smolvla(kind: Any = None, config: Any = None, **options: Any) -> Any:
     from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
     from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 
-    chosen = {
-        **features(),
-        **SIZES,
-        "resize_imgs_with_padding": (64, 64),
-        "num_vlm_layers": 2,
-        "num_steps": STEPS,
-        "load_vlm_weights": False,
-        **options,
-    }
+    chosen = {"resize_imgs_with_padding": (64, 64), "num_vlm_layers": 2, "load_vlm_weights": False}
+    chosen |= {"num_steps": STEPS, **features(), **SIZES, **options}
     with tiny_smolvlm(backbone):
         return (kind or SmolVLAPolicy)((config or SmolVLAConfig)(**chosen))
 
@@ -68,28 +57,13 @@ def tiny_smolvlm(backbone: Any) -> Any:
     """SmolVLA's vision-language model, for whatever is built inside."""
     from transformers import SmolVLMConfig
 
-    text = {
-        "model_type": "llama",
-        "hidden_size": 64,
-        "intermediate_size": 128,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 4,
-        "num_key_value_heads": 2,
-        "head_dim": 16,
-        "vocab_size": 64,
-        "pad_token_id": 0,
-    }
-    vision = {
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "image_size": 64,
-        "patch_size": 16,
-    }
-    model = SmolVLMConfig(
-        text_config=text, vision_config=vision, scale_factor=2, image_token_id=1, pad_token_id=0
-    )
+    text = {"model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 2}
+    text |= {"num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16}
+    text |= {"vocab_size": 64, "pad_token_id": 0}
+    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2}
+    vision |= {"image_size": 64, "patch_size": 16}
+    tokens = {"image_token_id": 1, "pad_token_id": 0}
+    model = SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=2, **tokens)
     tokenizer = SimpleNamespace(fake_image_token_id=2, global_image_token_id=3)
     processor = SimpleNamespace(tokenizer=tokenizer)
     with (
@@ -104,14 +78,8 @@ def make_pi(family: str, kind: Any = None, config: Any = None, **options: Any) -
     modeling = importlib.import_module(f"lerobot.policies.{family}.modeling_{family}")
     configuration = importlib.import_module(f"lerobot.policies.{family}.configuration_{family}")
     name = family.upper()
-    chosen = {
-        **features(),
-        **SIZES,
-        "num_inference_steps": STEPS,
-        "image_resolution": (64, 64),
-        "dtype": "float32",
-        **options,
-    }
+    chosen = {"num_inference_steps": STEPS, "image_resolution": (64, 64), "dtype": "float32"}
+    chosen |= {**features(), **SIZES, **options}
     with tiny_gemma(modeling):
         policy = kind or getattr(modeling, f"{name}Policy")
         return policy((config or getattr(configuration, f"{name}Config"))(**chosen))
@@ -162,26 +130,11 @@ def tiny_groot() -> Any:
     from lerobot.policies.groot.modeling_groot import GrootPolicy
     from transformers.feature_extraction_utils import BatchFeature
 
-    sizes = GR00TN17Config(
-        backbone_embedding_dim=32,
-        max_state_dim=8,
-        max_action_dim=PADDED,
-        action_horizon=LENGTH,
-        hidden_size=32,
-        input_embedding_dim=32,
-        max_num_embodiments=4,
-        num_inference_timesteps=STEPS,
-        use_alternate_vl_dit=True,
-        state_dropout_prob=0.0,
-        diffusion_model_cfg={
-            **ATTENTION,
-            "num_layers": 4,
-            "norm_type": "ada_norm",
-            "output_dim": 32,
-            "interleave_self_attention": True,
-        },
-        vl_self_attention_cfg={**ATTENTION, "num_layers": 1},
-    )
+    diffusion = {**DIFFUSION, "num_layers": 4}
+    head = {"diffusion_model_cfg": diffusion, "vl_self_attention_cfg": {**ATTENTION, "num_layers": 1}}
+    head |= {"action_horizon": LENGTH, "num_inference_timesteps": STEPS, "max_num_embodiments": 4}
+    head |= {"max_state_dim": 8, "max_action_dim": PADDED, "use_alternate_vl_dit": True}
+    sizes = GR00TN17Config(**WIDTHS, **head, state_dropout_prob=0.0)
 
     class Model(torch.nn.Module):
         def __init__(self) -> None:
@@ -193,13 +146,8 @@ def tiny_groot() -> Any:
             tokens = inputs["input_ids"]
             mask = torch.ones_like(tokens, dtype=torch.bool)
             image = torch.arange(tokens.shape[1]) < tokens.shape[1] // 2
-            return BatchFeature(
-                data={
-                    "backbone_features": self.embedding(tokens),
-                    "backbone_attention_mask": mask,
-                    "image_mask": image.expand_as(mask),
-                }
-            )
+            features = {"backbone_features": self.embedding(tokens), "backbone_attention_mask": mask}
+            return BatchFeature(data=features | {"image_mask": image.expand_as(mask)})
 
         def forward(self, inputs: Any) -> Any:
             head = self.action_head
@@ -232,30 +180,12 @@ def make_groot_n15(**options: Any) -> Any:
             features = self.embedding(tokens)
             return BatchFeature(data={"backbone_features": features, "backbone_attention_mask": mask})
 
-    head = {
-        "diffusion_model_cfg": {
-            **ATTENTION,
-            "num_layers": 2,
-            "norm_type": "ada_norm",
-            "output_dim": 32,
-            "interleave_self_attention": True,
-            "cross_attention_dim": 32,
-        },
-        "vl_self_attention_cfg": {**ATTENTION, "num_layers": 1},
-        "input_embedding_dim": 32,
-        "backbone_embedding_dim": 32,
-        "hidden_size": 32,
-        "max_seq_len": 64,
-        "action_dim": PADDED,
-        "action_horizon": LENGTH,
-        "max_state_dim": 8,
-        "max_num_embodiments": 32,
-        "num_target_vision_tokens": 4,
-        "num_inference_timesteps": STEPS,
-    }
-    sizes = groot_n1.GR00TN15Config(
-        backbone_cfg={}, action_head_cfg=head, action_horizon=LENGTH, action_dim=PADDED
-    )
+    diffusion = {**DIFFUSION, "num_layers": 2, "cross_attention_dim": 32}
+    head = {"diffusion_model_cfg": diffusion, "vl_self_attention_cfg": {**ATTENTION, "num_layers": 1}}
+    head |= {"max_seq_len": 64, "max_state_dim": 8, "max_num_embodiments": 32, "num_target_vision_tokens": 4}
+    actions = {"action_dim": PADDED, "action_horizon": LENGTH}
+    head |= {"num_inference_timesteps": STEPS, **WIDTHS, **actions}
+    sizes = groot_n1.GR00TN15Config(backbone_cfg={}, action_head_cfg=head, **actions)
     chosen = {**features(), **SIZES, "use_bf16": False, **options}
     model = groot_n1.GR00TN15
 
@@ -275,33 +205,13 @@ def make_multi_task_dit(**options: Any) -> Any:
     from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
     from transformers import CLIPTextConfig
 
-    text, config = (
-        modeling.CLIPTextModel,
-        CLIPTextConfig(
-            hidden_size=32,
-            intermediate_size=64,
-            num_hidden_layers=1,
-            num_attention_heads=2,
-            vocab_size=64,
-            projection_dim=32,
-            eos_token_id=2,
-        ),
-    )
-    chosen = {
-        **features(image=None),
-        "n_obs_steps": 2,
-        "horizon": LENGTH,
-        "n_action_steps": 4,
-        "objective": "flow_matching",
-        "hidden_dim": 32,
-        "num_layers": 2,
-        "num_heads": 2,
-        "dropout": 0.0,
-        "num_integration_steps": STEPS,
-        **options,
-    }
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "projection_dim": 32, "vocab_size": 64}
+    config = CLIPTextConfig(**sizes, num_hidden_layers=1, num_attention_heads=2, eos_token_id=2)
+    chosen = {"n_obs_steps": 2, "horizon": LENGTH, "n_action_steps": 4, "num_integration_steps": STEPS}
+    chosen |= {"hidden_dim": 32, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
+    chosen |= {"objective": "flow_matching", **features(image=None), **options}
     small = classmethod(lambda kind, *args, **kwargs: kind(config))
-    with mock.patch.object(text, "from_pretrained", small):
+    with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", small):
         return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**chosen))
 
 
@@ -309,48 +219,15 @@ def make_xvla(**options: Any) -> Any:
     from lerobot.policies.xvla.configuration_xvla import XVLAConfig
     from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
 
-    florence = {
-        "vision_config": {
-            "embed_dim": [16, 16, 16, 16],
-            "num_heads": [2, 2, 2, 2],
-            "num_groups": [2, 2, 2, 2],
-            "depths": [1, 1, 1, 1],
-            "window_size": 2,
-            "projection_dim": 32,
-        },
-        "text_config": {
-            "vocab_size": 64,
-            "d_model": 32,
-            "encoder_layers": 1,
-            "decoder_layers": 1,
-            "encoder_attention_heads": 2,
-            "decoder_attention_heads": 2,
-            "encoder_ffn_dim": 32,
-            "decoder_ffn_dim": 32,
-            "max_position_embeddings": 64,
-            "pad_token_id": 1,
-        },
-        "image_token_id": 63,
-        "pad_token_id": 1,
-        "bos_token_id": 0,
-        "eos_token_id": 2,
-    }
-    chosen = {
-        **features(),
-        "chunk_size": LENGTH,
-        "n_action_steps": LENGTH,
-        "florence_config": florence,
-        "hidden_size": 32,
-        "depth": 2,
-        "num_heads": 2,
-        "len_soft_prompts": 2,
-        "max_len_seq": 256,
-        "action_mode": "auto",
-        "max_action_dim": PADDED,
-        "max_state_dim": 8,
-        "num_denoising_steps": STEPS,
-        **options,
-    }
+    stages = {"embed_dim": [16] * 4, "num_heads": [2] * 4, "num_groups": [2] * 4, "depths": [1] * 4}
+    coders = {"layers": 1, "attention_heads": 2, "ffn_dim": 32}
+    text = {f"{coder}_{size}": n for coder in ("encoder", "decoder") for size, n in coders.items()}
+    text |= {"vocab_size": 64, "d_model": 32, "max_position_embeddings": 64, "pad_token_id": 1}
+    tokens = {"image_token_id": 63, "pad_token_id": 1, "bos_token_id": 0, "eos_token_id": 2}
+    vision = {**stages, "window_size": 2, "projection_dim": 32}
+    chosen = {"florence_config": {"vision_config": vision, "text_config": text, **tokens}}
+    chosen |= {"hidden_size": 32, "depth": 2, "num_heads": 2, "len_soft_prompts": 2, "max_len_seq": 256}
+    chosen |= {"action_mode": "auto", "num_denoising_steps": STEPS, **SIZES, **features(), **options}
     return XVLAPolicy(XVLAConfig(**chosen))
 
 
@@ -368,8 +245,11 @@ MAKERS = (
 )
 
 
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
 def width(family: str) -> int:
-    """``D``, by hand."""
     return ACTION if family == "multi_task_dit" else PADDED
 
 
@@ -382,11 +262,8 @@ def observations(family: str, size: int, seed: int = 0) -> dict[str, torch.Tenso
 
     tokens = torch.randint(3, 60, (size, 5), generator=generator)
     if family == "groot":
-        return {
-            "eagle_input_ids" if N15 else "input_ids": tokens,
-            "state": normal(size, 1, 8),
-            "embodiment_id": torch.zeros(size, dtype=torch.long),
-        }
+        seen = {"state": normal(size, 1, 8), "embodiment_id": torch.zeros(size, dtype=torch.long)}
+        return seen | {"eagle_input_ids" if N15 else "input_ids": tokens}
     language = {
         "observation.language.tokens": tokens,
         "observation.language.attention_mask": torch.ones_like(tokens, dtype=torch.bool),

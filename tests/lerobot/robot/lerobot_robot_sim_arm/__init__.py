@@ -15,6 +15,23 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 JOINTS = ("shoulder.pos", "elbow.pos")
 
 
+class Device:
+    """What both have in common."""
+
+    action_features = dict.fromkeys(JOINTS, float)
+    is_calibrated, is_connected = True, False
+
+    def connect(self, calibrate=True):
+        self.is_connected = True
+
+    def calibrate(self): ...
+
+    def configure(self): ...
+
+    def disconnect(self):
+        self.is_connected = False
+
+
 @RobotConfig.register_subclass("sim_arm")
 @dataclass(kw_only=True)
 class SimArmConfig(RobotConfig):
@@ -23,40 +40,16 @@ class SimArmConfig(RobotConfig):
     log: str = ""
 
 
-class SimArm(Robot):
+class SimArm(Device, Robot):
     """Two joints that go half of the way to their targets at every step."""
 
     config_class, name = SimArmConfig, "sim_arm"
     cameras = {"front": None}  # noqa: RUF012
+    observation_features = {**dict.fromkeys(JOINTS, float), "front": (48, 64, 3)}  # noqa: RUF012
 
     def __init__(self, config):
         super().__init__(config)
-        self.config, self.connected, self.joints, self.sent = config, False, dict.fromkeys(JOINTS, 0.0), []
-
-    @property
-    def observation_features(self):
-        return {**dict.fromkeys(JOINTS, float), "front": (48, 64, 3)}
-
-    @property
-    def action_features(self):
-        return dict.fromkeys(JOINTS, float)
-
-    @property
-    def is_connected(self):
-        return self.connected
-
-    @property
-    def is_calibrated(self):
-        return True
-
-    def connect(self, calibrate=True):
-        self.connected = True
-
-    def calibrate(self):
-        pass
-
-    def configure(self):
-        pass
+        self.config, self.joints, self.sent = config, dict.fromkeys(JOINTS, 0.0), []
 
     def get_observation(self):
         image = np.zeros((48, 64, 3), np.uint8)
@@ -69,7 +62,7 @@ class SimArm(Robot):
         return action
 
     def disconnect(self):
-        self.connected = False
+        super().disconnect()
         if self.config.log:
             Path(self.config.log).write_text(json.dumps(self.sent))
 
@@ -80,39 +73,13 @@ class SimLeaderConfig(TeleoperatorConfig):
     """Without options."""
 
 
-class SimLeader(Teleoperator):
+class SimLeader(Device, Teleoperator):
     """Moves both joints to and fro."""
 
     config_class, name = SimLeaderConfig, "sim_leader"
     feedback_features = {}  # noqa: RUF012
-    is_calibrated = True
-
-    def __init__(self, config):
-        super().__init__(config)
-        self.connected = False
-
-    @property
-    def action_features(self):
-        return dict.fromkeys(JOINTS, float)
-
-    @property
-    def is_connected(self):
-        return self.connected
-
-    def connect(self, calibrate=True):
-        self.connected = True
-
-    def calibrate(self):
-        pass
-
-    def configure(self):
-        pass
 
     def get_action(self):
         return {name: 0.5 * math.sin(3 * time.monotonic() + k) for k, name in enumerate(JOINTS)}
 
-    def send_feedback(self, feedback):
-        pass
-
-    def disconnect(self):
-        self.connected = False
+    def send_feedback(self, feedback): ...
