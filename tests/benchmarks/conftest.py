@@ -1,14 +1,13 @@
-"""What the tests of the benchmarks share."""
-
-from __future__ import annotations
-
 from concurrent.futures import Future
-from importlib.util import find_spec
 
 import pytest
 
+pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+from lab import jobs, pictures
+from lab import policies as common
 from tests.data.synthetic import write_robomimic_file
-from warmprior.envs.tasks import TaskSpec
 
 
 class Inline:
@@ -21,8 +20,6 @@ class Inline:
         return True
 
     def submit(self, job):
-        from lab import jobs
-
         future = Future()
         future.set_result(jobs.call(job.function, job.args))
         return future
@@ -32,14 +29,11 @@ class Inline:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def inline(request):
+def inline(request, short_episodes):
     """Jobs are computed here, and no video is made, unless a test asks for it."""
-    if find_spec("tyro") is None or request.path.name == "test_jobs.py":
+    if request.path.name == "test_jobs.py":
         yield
         return
-    from lab import jobs, pictures
-    from lab import policies as common
-
     with pytest.MonkeyPatch.context() as patch:
         local = jobs.Local
         patch.setattr(jobs, "Local", Inline)
@@ -47,14 +41,6 @@ def inline(request):
         yield local
     for cached in (common.cached_task, common.prepared, common.simulator):
         cached.cache_clear()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_episodes():
-    """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
-        yield
 
 
 @pytest.fixture(scope="session")

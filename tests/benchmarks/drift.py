@@ -1,7 +1,5 @@
 """A task of a user's own whose comparisons take seconds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch
@@ -22,7 +20,7 @@ class DriftEnv(CountingEnv):
     Episodes last 9 to 15 steps. It measures how far it is on that side.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(length=9)
         self.seed_ = 0
         flag = Categorical(2, dtype=torch.bool, shape=(1,))
@@ -35,9 +33,8 @@ class DriftEnv(CountingEnv):
 
     def _seen(self, out):
         side = self.state[:ACTION_DIM].sum().reshape(1)
-        return out.update(
-            {"observation": self.state.clone(), "solved": out["done"] & (side > 0), "side": side}
-        )
+        seen = {"observation": self.state.clone(), "solved": out["done"] & (side > 0), "side": side}
+        return out.update(seen)
 
     def _reset(self, tensordict=None, **kwargs):
         self.state = torch.randn(OBSERVATION_DIM, generator=torch.Generator().manual_seed(self.seed_))
@@ -49,14 +46,11 @@ class DriftEnv(CountingEnv):
 
 
 def demonstrations(seed=0):
-    generator, lengths = torch.Generator().manual_seed(seed), torch.tensor([30, 5, 40])
-    parts = [
-        [torch.randn(n, width, generator=generator) for width in (OBSERVATION_DIM, ACTION_DIM)]
-        for n in lengths
-    ]
-    seen = torch.cat([seen.cumsum(0) for seen, _ in parts])
-    actions = torch.cat([actions for _, actions in parts])
-    episode = torch.arange(3).repeat_interleave(lengths)
+    generator, lengths = torch.Generator().manual_seed(seed), [30, 5, 40]
+    numbers = torch.randn(75, OBSERVATION_DIM + ACTION_DIM, generator=generator)
+    seen, actions = numbers.split([OBSERVATION_DIM, ACTION_DIM], -1)
+    seen = torch.cat([part.cumsum(0) for part in seen.split(lengths)])
+    episode = torch.arange(3).repeat_interleave(torch.tensor(lengths))
     return TensorDict({"observation": seen, "action": actions.tanh(), "episode": episode}, [75])
 
 
@@ -67,7 +61,6 @@ def task(options=None, seed=0):
 
 
 def other(options):
-    """The same with other demonstrations."""
     return task(options, seed=1)
 
 
@@ -89,14 +82,12 @@ def mute(options):
 
 
 def narrow(options):
-    """With demonstrations of other observations."""
     data = demonstrations()
     data["observation"] = data["observation"][:, 1:]
     return Task.of("drift", data, DriftEnv, style="own", success="solved")
 
 
 def broken(options):
-    """With an environment that fails once it is played."""
     return replace(task(options), make_env=Broken)
 
 
@@ -116,7 +107,6 @@ class Widening(PastPrior, torch.nn.Module):
 
 
 def arguments(out, **more):
-    """A command line of robomimic.py on it."""
     values = {"task": f"{__name__}:task", "out": out, "prior": ["gaussian", "past", "preview"], "chunk": H}
     values |= {"iterations": 20, "batch_size": 16, "learning_rate": 1e-2, "checkpoints": 2, "log_every": 5}
     values |= {"hidden_dim": 16, "episodes": 7, "seeds": 2, "nfe": [3, 1], "envs": 1, "logger": "none"}

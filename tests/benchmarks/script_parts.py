@@ -1,7 +1,3 @@
-"""Command lines of the benchmarks, and what they leave behind."""
-
-from __future__ import annotations
-
 import json
 import re
 
@@ -33,17 +29,14 @@ def refused(main, argv, capsys):
 
 
 def stored(out, name="results"):
-    """The rows of a file in an output folder."""
     return [json.loads(line) for line in (out / f"{name}.jsonl").read_text().splitlines()]
 
 
 def described(out, name):
-    """Another file of an output folder: options or tasks."""
     return json.loads((out / f"{name}.json").read_text())
 
 
 def written(folder):
-    """When each file of weights and states was written."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
 
 

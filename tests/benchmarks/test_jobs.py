@@ -1,7 +1,5 @@
 """Jobs on fake work: order, failures, dead workers, killed drivers; on this machine and on Ray."""
 
-from __future__ import annotations
-
 import functools
 import os
 import signal
@@ -14,12 +12,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-pytest.importorskip("loky")
-pytest.importorskip("tyro")
-
 from lab import jobs
 from lab.jobs import Jobs
 from lab.options import Run
+from tests.errors import raises
 from tests.processes import apart
 
 
@@ -106,7 +102,7 @@ def test_the_last_trainings_start_before_episodes_and_an_error_kills_the_workers
     assert all(place[f"train {n}"] < place[f"play {n}"] for n in range(5))
     # A policy is played before the next is trained, but the last two trainings wait for no episode.
     assert place["play 0"] < place["train 2"] and place["train 4"] < place["play 2"]
-    with pytest.raises(OSError, match="full"), Jobs(Run()) as pool:
+    with raises(OSError, "disk full"), Jobs(Run()) as pool:
         pool.submit("write", train, then=lambda result: (_ for _ in ()).throw(OSError("disk full")))
         pool.wait()
     assert engine.killed is True

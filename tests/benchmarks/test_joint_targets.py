@@ -1,15 +1,8 @@
-"""Demonstrations of a follower arm that gets joint targets."""
-
-from __future__ import annotations
-
+import h5py
+import joint_targets
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("robosuite")
-
-import h5py
-import joint_targets
 
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions

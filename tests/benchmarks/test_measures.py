@@ -1,15 +1,11 @@
 """What is measured of policies: straightness on fields whose ratios are known, and memory."""
 
-from __future__ import annotations
-
 import math
 import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
-
-pytest.importorskip("tyro")
 
 from lab import measures
 from lab.measures import measure

@@ -1,14 +1,10 @@
-"""Methods by name: equal where they do the same, refused where an option means nothing."""
-
-from __future__ import annotations
-
 import pickle
 
-import pytest
 import torch
 
 from lab.bridge import BridgeCoupling
 from lab.methods import METHODS, Method
+from tests.errors import raises
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
 from warmprior.objectives import OTCoupling, ReflowCoupling
@@ -49,20 +45,15 @@ def test_every_method_arrives_in_a_fresh_process():
         assert method.prediction_length == (2 * H if method.name in ("preview", "warm-start") else H)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("nobodys", H), "unknown prior 'nobodys'.*methods: gaussian, past"),
-        (("past,age=3", H), r"age is unknown to it.*its options are sigma, correlation"),
-        (("gaussian,sigma=0.3", H), "sigma is unknown to it, or without effect"),
-        (("past,sigma=0.3", H, 0.5), "both set sigma"),
-        (("bridge,sigma=1", H), "sigma is unknown to it.*its options are noise"),
-        (("warmprior:PastPrior", H), "is a part of methods, and none itself"),
-    ],
-)
-def test_what_cannot_be_is_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Method(*arguments)
+def test_what_cannot_be_is_named():
+    for arguments, *facts in (
+        *((("nobodys", H), "'nobodys'", "gaussian, past"), (("past,age=3", H), "age", "sigma, correlation")),
+        *((("gaussian,sigma=0.3", H), "sigma"), (("past,sigma=0.3", H, 0.5), "sigma")),
+        (("bridge,sigma=1", H), "sigma", "noise"),
+        (("warmprior:PastPrior", H), "warmprior:PastPrior"),
+    ):
+        with raises(ValueError, *facts):
+            Method(*arguments)
 
 
 def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
@@ -71,7 +62,7 @@ def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
     assert (source.sample() == 0).all() and not source.warm.any()
     assert method.recipe(TrainingConfig()).times == "start" and not method.is_flow
     assert method.nfes((9, 3)) == [1] and Method("past", H).nfes((1, 9, 1)) == [9, 1]
-    with pytest.raises(ValueError, match=r"l1|self|objective"):
+    with raises(ValueError, "self_distillation", "'start'"):
         method.recipe(TrainingConfig(self_distillation=1.0))
 
 

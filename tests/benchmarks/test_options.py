@@ -1,20 +1,13 @@
-"""Options: what a command line, a preset and a stored file say, and how the two meet."""
-
-from __future__ import annotations
-
 import copy
 import importlib
 import json
 import re
 from dataclasses import replace
 
-import pytest
-
-pytest.importorskip("tyro")
-
 import budget
 import navigation1d
 import prior_space_rl
+import pytest
 import real_time_chunking
 import sigma
 from mimicgen_tasks import FEW
@@ -24,6 +17,7 @@ from lab.options import Options
 from lab.presets import PRESETS, study
 from lab.report import unlike
 from lab.stored_options import from_record, recorded, stored_options
+from tests.errors import raises
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [
@@ -76,37 +70,37 @@ def test_a_run_continues_with_its_options_and_refuses_others(tmp_path, monkeypat
     again = read(*resume, "--envs", 3, out=out)
     assert replace(again, run=first.run) == first and again.data.dataset == file and again.run.envs == 3
     for words, changed in (("--seed 4", "--seed"), ("--compile --seeds 2", "--compile, --seeds")):
-        with pytest.raises(ValueError, match=f"was started with other values of {changed}: leave"):
+        with raises(ValueError, changed):
             read(*resume, *words.split(), out=out)
-    with pytest.raises(ValueError, match="holds a run: add --resume"):
+    with raises(ValueError, "--resume", out):
         read(out=out)
-    with pytest.raises(ValueError, match=r"there is no run in .*empty"):
+    with raises(ValueError, tmp_path / "empty"):
         read(*resume, out=tmp_path / "empty")
-    with pytest.raises(ValueError, match="holds a run of a-study: continue it with that script"):
+    with raises(ValueError, "a-study"):
         parse(PRESETS, [*resume, "--out", str(out)], "sigma", None)
     stored = json.loads((out / "options.json").read_text())
-    for part, name, value, why in (
-        ("training", "iterations", "many", "valid integer"),
-        ("evaluation", "nfe", [1, "two"], "valid integer"),
-        ("run", "tusk", 1, "differs in --tusk"),
-        ("training", "iterations", -1, "at least 1"),
+    for part, name, value, fact in (
+        ("training", "iterations", "many", "integer"),
+        ("evaluation", "nfe", [1, "two"], "integer"),
+        ("run", "tusk", 1, "--tusk"),
+        ("training", "iterations", -1, -1),
     ):
         damaged = copy.deepcopy(stored)
         damaged["options"][part][name] = value
         (out / "options.json").write_text(json.dumps(damaged))
-        with pytest.raises(ValueError, match=rf"^.*options\.json is damaged.*{why}.*$"):  # in one line
+        with raises(ValueError, out / "options.json", fact) as caught:
             read(*resume, out=out)
+        assert "\n" not in str(caught.value)
     for damaged in (None, [], "x", {}, {"study": "robomimic", "options": []}):
         (out / "options.json").write_text(json.dumps(damaged))
-        with pytest.raises(ValueError, match=r"options\.json is damaged"):
+        with raises(ValueError, out / "options.json"):
             stored_options(Options, out, None)
 
 
 def test_an_option_that_a_file_lacks_is_no_default(tmp_path):
     """Without `dataset` a run would generate demonstrations of its own, for minutes."""
-    file = tmp_path / "file.hdf5"
+    file, path = tmp_path / "file.hdf5", tmp_path / "out" / "options.json"
     file.touch()
-    path = tmp_path / "out" / "options.json"
     path.parent.mkdir()
     record = {"study": "a-study", "options": recorded(read("--dataset", file, out=path.parent))}
     path.write_text(json.dumps(record))
@@ -116,16 +110,14 @@ def test_an_option_that_a_file_lacks_is_no_default(tmp_path):
             damaged = copy.deepcopy(record)
             del damaged["options"][part][name]
             path.write_text(json.dumps(damaged))
-            with pytest.raises(ValueError, match=rf"options\.json .*--{name.replace('_', '-')}"):
+            with raises(ValueError, "options.json", f"--{name.replace('_', '-')}"):
                 stored_options(Options, path.parent, "a-study")
 
 
-@pytest.mark.parametrize(
-    "option", ["demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "envs"]
-)
-def test_counts_that_could_not_be_listed(tmp_path, option):
-    with pytest.raises(ValueError, match=rf"--{option} must be at most 10,000,000, got {10**23}"):
-        read(f"--{option}", 10**23, out=tmp_path)
+def test_counts_that_could_not_be_listed(tmp_path):
+    for option in ("demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "envs"):
+        with raises(ValueError, f"--{option}", "10,000,000", 10**23):
+            read(f"--{option}", 10**23, out=tmp_path)
 
 
 def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
@@ -134,7 +126,7 @@ def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
         path = tmp_path / "options.json"
         path.write_text(path.read_text().replace('"device": "cpu"', '"device": "cuda:99"'))
     assert stored_options(Options, tmp_path, "a-study").run.device == "cuda:99"
-    with pytest.raises(ValueError, match="--device cuda:99 does not work here"):
+    with raises(ValueError, "--device", "cuda:99"):
         read("--resume", out=tmp_path)
 
 
@@ -159,15 +151,18 @@ def test_tables_name_what_is_not_the_papers():
     (line,) = unlike(read("--preset", "paper", *words.split()), PRESETS["paper"])
     changed = "times u-shaped (uniform); objective l1 (velocity); self distillation 0.5 (0.0)"
     assert line.endswith(f": {changed}; grid dense-jump (uniform).")
-    (line,) = unlike(read("--preset", "much-ado", "--warmup-ratio", 0.2), PRESETS["paper"])
-    assert "actions absolute (delta)" in line and "max grad norm 100.0 (None)" in line
-    assert "temperature 0.0 (1.0)" in line and "warmup" not in line
-    # The weighting is that in force, which follows from the network where none is given.
-    (line,) = unlike(read(), PRESETS["paper"])
-    for words in ("weighting standardised (velocity)", "network mlp (chi_transformer)", "(200000)"):
-        assert words in line
-    (line,) = unlike(read("--obs", "image", "--encoder", "small"), PRESETS["paper"])
-    assert "obs" not in line and "image size 48 (84)" in line
+    for words, named, left_out in (
+        (
+            "--preset much-ado --warmup-ratio 0.2",
+            ["actions absolute (delta)", "max grad norm 100.0 (None)", "temperature 0.0 (1.0)"],
+            "warmup",
+        ),
+        # The weighting is that in force, which follows from the network where none is given.
+        ("", ["weighting standardised (velocity)", "network mlp (chi_transformer)", "(200000)"], "obs"),
+        ("--obs image --encoder small", ["image size 48 (84)"], "obs"),
+    ):
+        (line,) = unlike(read(*words.split()), PRESETS["paper"])
+        assert all(name in line for name in named) and left_out not in line
     assert unlike(FEW["paper"], FEW["paper"]) == []  # its images have a batch size of their own
 
 

@@ -1,15 +1,22 @@
 """Every number that the code has from the paper, compared with the table of facts."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import math
 
+import mimicgen_tasks
+import prior_space_rl
 import pytest
+import robomimic
 import torch
 from torch import nn
 
+from lab import paper, timing
+from lab.command_line import parse
+from lab.options import with_parts
+from lab.presets import IMAGES, PRESETS
+from lab.stored_options import recorded
+from lab.tasks import navigation_task
 from tests import paper_facts as facts
 from warmprior import (
     ChiTransformer,
@@ -28,21 +35,6 @@ from warmprior.objectives.self_distillation import TEACHER_STEPS
 from warmprior.rl import PriorSpaceConfig
 from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
-
-pytest.importorskip("matplotlib")
-pytest.importorskip("robosuite")
-pytest.importorskip("tyro")
-
-import mimicgen_tasks
-import prior_space_rl
-import robomimic
-
-from lab import paper, timing
-from lab.command_line import parse
-from lab.options import with_parts
-from lab.presets import IMAGES, PRESETS
-from lab.stored_options import recorded
-from lab.tasks import navigation_task
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
 SCRIPTS = ("robomimic", "curvature", "sigma", "chunking", "budget", "real_time_chunking", "pusht")

@@ -1,13 +1,7 @@
 """Pictures of the benchmarks: which numbers they show. That each is written, the studies' tests say."""
 
-from __future__ import annotations
-
 import pandas as pd
 import pytest
-
-pytest.importorskip("matplotlib")
-pytest.importorskip("tyro")
-
 from matplotlib.image import imread
 
 from lab import plots
@@ -17,7 +11,6 @@ from tests.benchmarks.test_report import compared, row
 
 @pytest.fixture
 def figures(monkeypatch):
-    """The axes of every figure that is drawn."""
     drawn, make = [], plots.new_figure
 
     def spy(*args, **options):

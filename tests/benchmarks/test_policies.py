@@ -1,17 +1,9 @@
-"""Comparisons as users see them: what is trained, played, continued and refused."""
-
-from __future__ import annotations
-
 import json
 from itertools import product
 
 import pytest
-import torch
-
-pytest.importorskip("tyro")
-pytest.importorskip("pandas")
-
 import robomimic
+import torch
 from torchrl.envs import TransformedEnv
 
 from lab import jobs
@@ -23,6 +15,7 @@ from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
 from tests.benchmarks.drift import DriftEnv, arguments
 from tests.benchmarks.script_parts import refused, stored, written
+from tests.errors import raises
 from tests.processes import apart
 from tests.together import together
 from warmprior import RealTimeChunking, policy_transforms
@@ -38,7 +31,6 @@ def untimed(out):
 
 
 def policies_of(argv):
-    """The policies that a command line compares."""
     return common.policies_of(parse(PRESETS, argv, "robomimic", None))
 
 
@@ -190,7 +182,7 @@ def run(folder):
 
 def test_several_processes_train_together_and_one_plays(finished, tmp_path):
     """The rows have the facts and order of one process; each draws its own part of a batch."""
-    with pytest.raises(Exception, match=r"1 failed|preview.*the loss became nan"):
+    with raises(Exception, "failed"):
         together(run, tmp_path)
     facts = ("prior", "sigma", "seed", "checkpoint", "nfe")
     alone, both = ([[r[f] for f in facts] for r in stored(f)] for f in (finished, tmp_path / "out"))

@@ -1,24 +1,18 @@
-"""Tables of the benchmarks: which numbers end up in which cell."""
-
-from __future__ import annotations
-
 import itertools
 import json
 import math
 import re
 
+import memory
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import integrate, stats
 
-pytest.importorskip("tyro")
-
-import memory
-
 from lab import report
 from lab.files import PartialFailure
 from tests.benchmarks.script_parts import is_png
+from tests.errors import raises
 from tests.paper_facts import SIGMA_SUCCESS, SUCCESS
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
@@ -60,7 +54,6 @@ def cells_of(text, start):
 
 
 def lines_of(text):
-    """The lines of the last table of a text, by column."""
     found = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
     start = max(i for i, line in enumerate(found) if line[0] == "---") - 1
     return [dict(zip(found[start], line, strict=True)) for line in found[start + 2 :]]
@@ -194,7 +187,7 @@ def test_the_terminal_table_fits_and_says_first_what_came_out():
 
 def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys):
     summary = report.summary(compared(), 1)
-    with pytest.raises(PartialFailure, match=r"1 failed.*: past, seed 1: no memory"):
+    with raises(PartialFailure, "1", "past, seed 1: no memory"):
         report.write_report(tmp_path, "short", "# full\n", summary, ["past, seed 1: no memory"])
     text = (tmp_path / "report.md").read_text()
     assert text.startswith("# full\n\nMissing:\n\n- past, seed 1: no memory\n\nColumns")

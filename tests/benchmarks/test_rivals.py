@@ -1,12 +1,12 @@
 """Rivals that are composed of the library's parts, against their papers' algorithms by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 
 from lab.methods import Method
+from tests.errors import raises
+from tests.toy_env import stirred
 from warmprior import FlowMatchingLoss, VelocityMLP, WarmPriorActor, keys
 from warmprior.history import advance, cold_history
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -14,15 +14,12 @@ from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 H = 4
 
 
-def network(prediction_length: int) -> VelocityMLP:
+def network(prediction_length):
     torch.manual_seed(0)
-    made = VelocityMLP(2, 3, prediction_length, observation_steps=1, hidden_dim=16)
-    for parameter in made.parameters():  # the last layer begins at zero
-        torch.nn.init.normal_(parameter, std=0.3)
-    return made
+    return stirred(VelocityMLP(2, 3, prediction_length, observation_steps=1, hidden_dim=16), by=0.3)
 
 
-def predicted(field: VelocityMLP, t: float, point: torch.Tensor, observation: torch.Tensor) -> torch.Tensor:
+def predicted(field, t, point, observation):
     """The action that a velocity field says: f = a_t + (1 - t) v."""
     return point + (1 - t) * field(torch.full((len(point),), t), point, observation)
 
@@ -81,7 +78,7 @@ def test_a_warm_start_enters_the_flow_at_the_forecast():
     torch.testing.assert_close(start(noise, history, None), 0.75 * noise + 0.25 * known)
     cold = start(noise, cold_history([3], H, 2 * H, 2), None)
     torch.testing.assert_close(cold, 0.75 * noise)
-    with pytest.raises(ValueError, match="start_time"):
+    with raises(ValueError, "start_time"):
         Method("warm-start,start_time=1", H)
 
 
@@ -92,21 +89,12 @@ def test_mip_learns(precondition):
     method = Method("mip", H)
     observation = torch.rand(400, 1) * 2 - 1
     steps = {"observation": observation, "action": observation.sin(), "episode": torch.arange(400) // 100}
-    data = TensorDict({**steps}, [400])
-    actor = train_policy(
-        data,
-        method.prior(),
-        network=NetworkOptions(hidden_dim=32, observation_steps=1, precondition=precondition),
-        training=TrainingConfig(iterations=800, weighting=None if precondition else "velocity"),
-        coupling=method.coupling(),
-        **method.parts.played,
-        description=None,
-    )
-    assert (actor.sampling.evaluations(), actor.sampling.grid, actor.sampling.temperature) == (
-        2,
-        "dense-jump:0.9",
-        0,
-    )
+    options = {"network": NetworkOptions(hidden_dim=32, observation_steps=1, precondition=precondition)}
+    options["training"] = TrainingConfig(iterations=800, weighting=None if precondition else "velocity")
+    options |= {"coupling": method.coupling(), "description": None, **method.parts.played}
+    actor = train_policy(TensorDict(steps, [400]), method.prior(), **options)
+    sampling = actor.sampling
+    assert (sampling.evaluations(), sampling.grid, sampling.temperature) == (2, "dense-jump:0.9", 0)
     seen = torch.tensor([[-0.8], [0.0], [0.8]])
     units = actor.normalizer
     normalised = units.normalize(TensorDict({"observation": seen}, [3]))["observation"].unsqueeze(1)

@@ -1,7 +1,3 @@
-"""The benchmark from the command line: files, table, pictures, SIGKILL, and torchrun."""
-
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -9,24 +5,19 @@ import subprocess
 import sys
 import time
 
+import navigation1d
 import numpy as np
 import psutil
 import pytest
+import robomimic
 import torch
 from safetensors.torch import load_file
-
-from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
-from tests.processes import apart
-
-pytest.importorskip("robosuite")
-pytest.importorskip("tyro")
-
-import navigation1d
-import robomimic
 
 from lab import pictures
 from lab.command_line import parse, started
 from lab.presets import PRESETS
+from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
+from tests.processes import apart
 from warmprior.envs import rendering_backend
 from warmprior.training.checkpoint import load_state
 

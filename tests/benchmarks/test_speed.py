@@ -1,19 +1,12 @@
-"""Measurements of the library itself: their arithmetic against closed forms, and a short run of each."""
-
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 import time
 
-import pytest
-import torch
-
-pytest.importorskip("robosuite")
-
 import peers
+import pytest
 import throughput
+import torch
 
 from warmprior import GaussianPrior, window_replay_buffer
 

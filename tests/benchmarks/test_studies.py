@@ -1,30 +1,21 @@
-"""The studies from the command line: shared policies, rows, pictures, and what continues."""
-
-from __future__ import annotations
-
 import json
 import os
 import shutil
-
-import pytest
-
-from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
-from tests.data.synthetic import write_robomimic_file
-
-pytest.importorskip("h5py")
-pytest.importorskip("robosuite")
-pytest.importorskip("tyro")
+from itertools import product
 
 import budget
 import chunking
 import curvature
 import h5py
 import navigation1d
+import pytest
 import real_time_chunking
 import robomimic
 import sigma
 
 from tests.benchmarks import drift
+from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
+from tests.data.synthetic import write_robomimic_file
 from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import load_policy
@@ -34,7 +25,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*d
 
 @pytest.fixture(scope="module")
 def finished(inline, short_episodes, dataset, tmp_path_factory):
-    """A finished run of robomimic.py with two seeds."""
     out = tmp_path_factory.mktemp("runs") / "main"
     assert robomimic.main(options(dataset, out, seeds=2, iterations=60)) == 0
     return out
@@ -109,11 +99,8 @@ def test_chunk_lengths_of_two_tasks(tmp_path):
     out, tasks = tmp_path / "out", [f"{drift.__name__}:{name}" for name in ("task", "renamed")]
     argv = drift.arguments(out, task=tasks, chunk=[1, 8], prior=["gaussian", "past"], seeds=1, nfe=1)
     assert chunking.main(argv) == 0
-    rows = stored(out)
-    last = [row for row in rows if row["checkpoint"] == 20]
-    assert {(row["task"], row["chunk"]) for row in last} == {
-        (t, h) for t in ("drift", "Drift 2") for h in (1, 8)
-    }
+    last = [row for row in stored(out) if row["checkpoint"] == 20]
+    assert {(row["task"], row["chunk"]) for row in last} == set(product(("drift", "Drift 2"), (1, 8)))
     for row in last:
         assert row["boundary_jump"] > 0 and (row["inner_jump"] is None) == (row["chunk"] == 1)
     names = ("chunk_lengths_Drift-OWN", "chunk_lengths_Drift-2-OWN-*", "bars", "violins")
@@ -223,14 +210,10 @@ def test_real_time_chunking_of_a_task_beside_the_toy(dataset, tmp_path):
     argv = options(dataset, out, **TINY | own)
     assert real_time_chunking.main(argv) == 0
     rows = stored(out)
-    cells = [(row["task"], row["prior"], row["delay"], row["guidance"], row["execute"]) for row in rows]
-    assert cells == [
-        (task, prior, delay, guidance, 5)  # of 8, as many as the largest delay leaves
-        for task in ("lift", "navigation")
-        for prior in ("gaussian", "preview")
-        for delay in (0, 3)
-        for guidance in ("none", "rtc")
-    ]
+    cells = [tuple(row[name] for name in ("task", "prior", "delay", "guidance")) for row in rows]
+    values = ("lift", "navigation"), ("gaussian", "preview"), (0, 3), ("none", "rtc")
+    assert cells == list(product(*values))
+    assert {row["execute"] for row in rows} == {5}  # of 8, as many as the largest delay leaves
     report = (out / "report.md").read_text()
     assert "| Lift-PH | 2 | 3 | RTC + WP-Preview |" in report and "schedule linear" in report
     assert is_png(out / "real_time_chunking.png")

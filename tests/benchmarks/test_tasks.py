@@ -1,45 +1,36 @@
-"""Tasks, data and observations of other kinds through the benchmarks: policies, rows, and what reads them."""
-
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-import torch
-
-from lab.tasks import DataOptions
-from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
-from tests.data.synthetic import env_args_14, write_robomimic_file
-from tests.envs.mimicgen_stub import write_mimicgen
-from tests.processes import apart
-from warmprior import ImageEncoder
-from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
-from warmprior.diagnostics import encoded_windows
-from warmprior.training import load_policy
-from warmprior.training.checkpoint import load_state
-
-pytest.importorskip("robosuite")
-pytest.importorskip("tyro")
-
 import curvature
 import mimicgen_tasks
 import pusht
+import pytest
 import robomimic
+import torch
 
 from lab.options import Options, with_parts
 from lab.policies import policies_of
 from lab.stored_options import stored_options
+from lab.tasks import DataOptions
+from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
+from tests.data.synthetic import env_args_14, write_robomimic_file
+from tests.envs.mimicgen_stub import write_mimicgen
+from tests.errors import raises
+from tests.processes import apart
+from warmprior import ImageEncoder
+from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
+from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
+from warmprior.training import load_policy
+from warmprior.training.checkpoint import load_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
 
 def flow(run, validation, **more):
-    """Measure the flow of a run's policies; the report's text."""
     few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6}
     assert curvature.main(command_line(**few | more)) == 0
     return Path(f"{run}-flow", "report.md").read_text()
@@ -148,7 +139,7 @@ def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
     place = f"lerobot:{tmp_path}/pusht"
     given = [DataOptions(dataset=place, demonstrations=n) for n in ((), (2,), (4,))]
     every, two = map(pusht.task, given[:2])
-    with pytest.raises(DatasetError, match=r"3 demonstrations.*demos=4"):
+    with raises(DatasetError, 3, "demos=4"):
         pusht.task(given[2])
     # The agent, then the block's corners; both within [-1, 1].
     assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
