@@ -1,7 +1,5 @@
 """The programs of the pages run as they stand; what needs something of the reader's says so."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re
@@ -15,11 +13,8 @@ from tests.data.synthetic import write_robomimic_file
 from warmprior import Prior
 
 ROOT = Path(__file__).parents[1]
-PAGES = [
-    ROOT / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-    *sorted((ROOT / "docs" / "notes").iterdir()),
-]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "notes").iterdir())]
 GIVEN = re.compile(r"# Given: ([\w, ]+); .*\.\n")
 TRAINED = "iterations=1_000"
 """Only the long programs have this; tests/test_quickstart.py shortens them."""
@@ -62,16 +57,8 @@ def test_a_program_runs_in_a_fresh_process(files, text):
 
 @pytest.mark.parametrize("text", [pytest.param(text, id=name) for name, text in BLOCKS])
 def test_names_are_defined_or_said_to_be_given(text):
-    check = [
-        sys.executable,
-        "-m",
-        "ruff",
-        "check",
-        "--isolated",
-        "--select=F821",
-        "--output-format=json",
-        "-",
-    ]
+    words = "-m ruff check --isolated --select=F821 --output-format=json -"
+    check = [sys.executable, *words.split()]
     found = json.loads(subprocess.run(check, input=text, capture_output=True, text=True).stdout)
     undefined = {re.search("`(.*?)`", each["message"])[1] for each in found}
     given = GIVEN.match(text)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import doctest
 import importlib
 import inspect
@@ -140,13 +138,11 @@ def test_the_prior_of_your_own_runs():
     page = (DOCS / "extending.md").read_text()
     scope: dict = {}
     exec(compile(re.search(r"```python\n(.*?)```", page, re.S)[1], "extending.md", "exec"), scope)
-    history = window_history(
-        torch.rand(2, 3, 1), torch.tensor([[0], [3]]), torch.rand(2, 3, 1), chunk_length=3
-    )
+    actions, target = torch.rand(2, 2, 3, 1)
+    history = window_history(actions, torch.tensor([[0], [3]]), target, chunk_length=3)
     source = scope["LastAction"](3, sigma=0.3).distribution(history)
-    loc, warm = source.loc, source.warm
-    assert warm[..., 0].tolist() == [[False] * 3, [True] * 3]
-    assert (loc[1] == history["actions"][1, -1]).all()
+    assert source.warm[..., 0].tolist() == [[False] * 3, [True] * 3]
+    assert (source.loc[1] == history["actions"][1, -1]).all()
 
 
 def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
@@ -168,16 +164,12 @@ def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    """The pages, built without a warning."""
     pytest.importorskip("sphinx")
     out = tmp_path_factory.mktemp("docs")
     # Tutorials that ran before run again: what they use may have changed.
     run_all = ["-D", "sphinx_gallery_conf.run_stale_examples=True"]
-    apart = ["-d", str(tmp_path_factory.mktemp("doctrees"))]
-    subprocess.run(
-        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *run_all, *apart, str(DOCS), str(out)],
-        check=True,
-    )
+    words = ["-W", "--keep-going", "-q", *run_all, "-d", str(tmp_path_factory.mktemp("doctrees"))]
+    subprocess.run([sys.executable, "-m", "sphinx", *words, str(DOCS), str(out)], check=True)
     return out
 
 

@@ -1,7 +1,3 @@
-"""The gallery's page, its files, and the benchmarks that draw."""
-
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -10,13 +6,11 @@ PAGE = (ROOT / "docs" / "gallery.md").read_text()
 FILES = ROOT / "docs" / "_static" / "gallery"
 LIMIT, VIDEO_LIMIT = 4_000_000, 250_000
 DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|draw)\(|from robomimic import run\b")
-SHARED = ()
 
 
 def _drawing() -> dict[str, str]:
     """Benchmarks that draw, and their source: not throughput.py, which times."""
-    scripts = (ROOT / "benchmarks").glob("[!_]*.py")
-    found = {script.name: script.read_text() for script in scripts if script.name not in SHARED}
+    found = {script.name: script.read_text() for script in (ROOT / "benchmarks").glob("[!_]*.py")}
     return {name: source for name, source in found.items() if DRAWS.search(source)}
 
 
@@ -31,7 +25,6 @@ def _pictures() -> list[tuple[str, str]]:
 
 
 def _shown() -> set[str]:
-    """Paths of the pictures and videos that the page shows."""
     return {*(path for _, path in _pictures()), *re.findall(r'(?:src|href)="([^"#]+)', PAGE)}
 
 

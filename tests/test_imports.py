@@ -1,7 +1,5 @@
 """What the package may import, and what it may not contain: command lines, prints, benchmarks."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -12,6 +10,15 @@ from pathlib import Path
 import pytest
 
 import warmprior
+
+
+def ran(code, **environment):
+    environment = {**os.environ, **environment}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
 
 OPTIONAL = ("robosuite", "lerobot", "h5py", "matplotlib", "scipy", "numba", "gymnasium", "mujoco", "tyro")
 
@@ -51,14 +58,7 @@ def test_optional_packages_are_not_imported_and_a_policy_trains_without_them():
     heavy = ("robosuite", "lerobot", "h5py", "matplotlib", "numba", "tyro")
     code = f"import sys, warmprior; print([n for n in {heavy} if n in sys.modules])\n"
     again = "for name in [n for n in sys.modules if n.split('.')[0] == 'warmprior']: del sys.modules[name]\n"
-    done = subprocess.run(
-        [sys.executable, "-c", code + again + BLOCK.format(names=OPTIONAL) + TRAINED],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = ran(code + again + BLOCK.format(names=OPTIONAL) + TRAINED)
     assert done.stdout.splitlines()[-2:] == ["[]", "torch.Size([8, 4, 2])"]
 
 
@@ -103,7 +103,6 @@ COMMAND_LINES = ("__main__.py",)
 
 
 def sources():
-    """Every file of the package, by where it is in it."""
     return {path.relative_to(PACKAGE).as_posix(): path.read_text() for path in PACKAGE.rglob("*.py")}
 
 
@@ -145,10 +144,7 @@ print(*sorted(set(sys.modules) - before))
 
 
 def test_training_loads_neither_simulator_nor_renderer_nor_experts():
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED], capture_output=True, text=True, timeout=120, check=True
-    )
-    new = set(done.stdout.split())
+    new = set(ran(LOADED).stdout.split())
     assert "warmprior.training.train" in new
     heavy = {"robosuite", "mujoco", "OpenGL", "numba", "h5py", "lerobot", "loky", "matplotlib", "tyro"}
     assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
@@ -162,15 +158,6 @@ def test_scripts_find_the_lab_by_themselves_and_its_files_say_what_they_hold():
     for path in BENCHMARKS.glob("lab/**/*.py"):
         first, *_ = ast.get_docstring(ast.parse(path.read_text())).splitlines()
         assert first.endswith("."), path
-
-
-def ran(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a process of its own."""
-    environment = {**os.environ, **environment}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    return done
 
 
 def test_a_renderer_that_cannot_be_loaded_stops_no_import(tmp_path):

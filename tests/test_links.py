@@ -1,7 +1,5 @@
 """Links and pictures of the Markdown pages, as a repository shows them: file and heading are there."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path
@@ -13,7 +11,6 @@ LINK = re.compile(r"(?<!`)!?\[(?:[^\[\]]|\[[^\]]*\])*\]\(([^()\s]+(?:\([^)]*\))?
 
 
 def _tracked() -> list[Path]:
-    """The files of the repository, or of an archive of it."""
     try:
         listed = subprocess.run(
             ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, check=True

@@ -1,7 +1,3 @@
-"""``python -m warmprior``: saved policies without their data."""
-
-from __future__ import annotations
-
 import shutil
 
 import pytest
@@ -15,20 +11,14 @@ from warmprior.training.saved import load_policy, save_policy
 
 pytest.importorskip("robosuite")
 from warmprior.envs import rendering_backend
-from warmprior.envs.tasks import TaskSpec
 from warmprior.training import NetworkOptions, Task, TrainingConfig, play_episode, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 
-
-@pytest.fixture(scope="module", autouse=True)
-def short_episodes():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
-        yield
+pytestmark = pytest.mark.usefixtures("short_episodes")
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
+def saved(short_episodes, tmp_path_factory):
     """A policy of a few steps, whose demonstrations are gone; and one of its episodes."""
     folder = tmp_path_factory.mktemp("saved")
     path = folder / "lift.hdf5"
@@ -47,12 +37,23 @@ def saved(tmp_path_factory):
     return kept, episode
 
 
+def refused(argv, capsys):
+    """The line in which it refuses a command line."""
+    assert main(argv) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("warmprior: error: ")
+    return said
+
+
 def test_evaluate_plays_the_same_episodes(saved, capsys):
     folder, episode = saved
     assert main(["evaluate", str(folder), "--episodes", "1", "--nfe", "1"]) == 0
     said = capsys.readouterr().out
     assert f"{int(episode.success)} of 1 episodes solved" in said
     assert f" {episode.steps} control steps on average" in said
+    assert main(["info", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "PastPrior(chunk_length=8" in said and "Lift" in said and "VelocityMLP" in said
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
@@ -69,12 +70,6 @@ def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     # The arm moves, and neighbours look alike.
     far = abs(frames[0].astype(int) - frames[-1]).mean()
     assert far > abs(frames[0].astype(int) - frames[1]).mean()
-
-
-def test_info(saved, capsys):
-    assert main(["info", str(saved[0])]) == 0
-    said = capsys.readouterr().out
-    assert "PastPrior(chunk_length=8" in said and "Lift" in said and "VelocityMLP" in said
 
 
 def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, monkeypatch):
@@ -98,38 +93,34 @@ def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, mon
             assert "PastPrior(chunk_length=8" in capsys.readouterr().out
         assert main(["evaluate", "me/lift", "--episodes", "1", "--nfe", "1"]) == 0
         assert f" {episode.steps} control steps on average" in capsys.readouterr().out
-        for argv, message in (
+        for argv, fact in (
             (["info", "me/other"], "me/other"),
             (["info", "me/lift", "--revision", "v2"], "v2"),
-            (["push", "me/lift", "me/lift"], "there is no such folder"),
-            (["push", str(folder), "lift"], "use user/name"),
+            (["push", "me/lift", "me/lift"], "folder"),
+            (["push", str(folder), "lift"], "user/name"),
         ):
-            assert main(argv) == 2
-            said = capsys.readouterr().err
-            assert message in said and "warmprior: error: " in said
+            assert fact in refused(argv, capsys)
 
 
 def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
     bare = tmp_path / "bare"
     network = VelocityMLP(7, 19, 8, hidden_dim=8)
     save_policy(WarmPriorActor(network, PastPrior(8)), bare)
-    for argv, message in (
-        (["evaluate", str(tmp_path / "missing")], "no policy at"),
-        (["evaluate", str(bare)], "keeps no description of an environment"),
+    for argv, fact in (
+        (["evaluate", str(tmp_path / "missing")], f"{tmp_path}/missing"),
+        (["evaluate", str(bare)], "environment"),
         (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
-        (["evaluate", str(saved[0]), "--grid", "sparse"], "unknown grid 'sparse'"),
-        (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
-        (["evaluate", str(saved[0]), "--import", "no.such"], "No module named 'no'"),
-        (["info", str(tmp_path / "missing")], "no policy at"),
-        (["info", __file__], "it is a file"),
-        (["info", str(tmp_path)], "it holds the policies bare: name one of them"),
-        (["train", str(tmp_path)], f"is a folder: name a file, or a LeRobotDataset as lerobot:{tmp_path}"),
-        (["push", str(bare), "name", "--dry-run"], "'name' is not the name of a repository"),
-        (["evaluate", str(saved[0]), "--video", "out.txt"], "out.txt must end in .mp4"),
+        (["evaluate", str(saved[0]), "--grid", "sparse"], "'sparse'"),
+        (["evaluate", str(saved[0]), "--episodes", "0"], "episodes"),
+        (["evaluate", str(saved[0]), "--import", "no.such"], "'no'"),
+        (["info", str(tmp_path / "missing")], f"{tmp_path}/missing"),
+        (["info", __file__], "file"),
+        (["info", str(tmp_path)], "bare"),
+        (["train", str(tmp_path)], f"lerobot:{tmp_path}"),
+        (["push", str(bare), "name", "--dry-run"], "'name'"),
+        (["evaluate", str(saved[0]), "--video", "out.txt"], ".mp4"),
     ):
-        assert main(argv) == 2
-        said = capsys.readouterr().err
-        assert message in said and said.startswith("warmprior: error: ") and said.count("\n") == 1
+        assert fact in refused(argv, capsys)
 
 
 def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
@@ -148,17 +139,11 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--prior nobodys", "unknown prior 'nobodys'"),
-        ("missing.hdf5", "missing.hdf5: no such file"),
-        ("--chunk 0", "chunk_length"),
-    ],
+    ("words", "fact"),
+    [("--prior nobodys", "'nobodys'"), ("missing.hdf5", "missing.hdf5"), ("--chunk 0", "chunk_length")],
 )
-def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, message):
-    assert main(["train", *words.split(), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.startswith("warmprior: error: ")
+def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, fact):
+    assert fact in refused(["train", *words.split(), "--out", str(tmp_path / "out")], capsys)
     assert not (tmp_path / "out").exists()
 
 
@@ -173,9 +158,9 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     # Its actions are not near the arm; and of what it has, observations alone are named.
-    for more, message in (("--joint-key arm", "actions of cups"), ("--observation-keys leg", "leg")):
-        assert main([*words.split(), *more.split(), "--out", str(tmp_path / "out")]) == 2
-        said = capsys.readouterr().err
-        assert message in said and "timestamp" not in said
-    assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
-    assert "2 demonstrations, fewer than demos=3" in capsys.readouterr().err
+    for more, fact in (
+        *(("--joint-key arm", "cups"), ("--observation-keys leg", "leg")),
+        ("--demonstrations 3", "demos=3"),
+    ):
+        said = refused([*words.split(), *more.split(), "--out", str(tmp_path / "out")], capsys)
+        assert fact in said and "timestamp" not in said

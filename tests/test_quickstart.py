@@ -1,7 +1,5 @@
 """The programs of README and quickstart run as they stand, and print what the pages say."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

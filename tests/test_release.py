@@ -1,7 +1,5 @@
 """The files of a release agree: one version, commands that exist, workflows that can be read."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,13 +1,12 @@
 """What a source, a start point and a coupling must not hide: each was accepted without a word once."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
 from lab.methods import Method
+from tests.errors import raises
 from tests.toy_env import Halfway, demonstrations
 from warmprior import (
     FlowMatchingLoss,
@@ -64,8 +63,8 @@ def data():
     return demonstrations(40)
 
 
-def cloning(folder, data, **options):
-    actor = WarmPriorActor(network(), GaussianPrior(H), start=options.pop("start", None))
+def cloning(folder, data, start=None, **options):
+    actor = WarmPriorActor(network(), GaussianPrior(H), start=start)
     config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
     return BehaviourCloning(actor, data, config, folder, observation_steps=1, **options)
 
@@ -82,17 +81,17 @@ def test_a_mean_that_is_no_pair_is_named():
     actor = WarmPriorActor(network(), NoWarm(H))
     history = cold_history([2], H, H, D_A)
     for call in (lambda: PriorAnchor(actor), lambda: actor.prior.distribution(history)):
-        with pytest.raises(ValueError, match=r"NoWarm.mean must return two tensors.*got Tensor"):
+        with raises(ValueError, "NoWarm.mean", "Tensor"):
             call()
 
 
 def test_a_start_point_is_fixed_and_belongs_to_the_training(tmp_path, data):
-    with pytest.raises(ValueError, match=r"Halfway before the flow, and freeze it"):
+    with raises(ValueError, "Halfway"):
         cloning(tmp_path / "free", data, start=Halfway())
     training = cloning(tmp_path / "one", data, start=frozen())
     training.step()
     training._save()
-    with pytest.raises(ValueError, match="start"):
+    with raises(ValueError, "start"):
         cloning(tmp_path / "one", data, start=frozen(1.0))
     assert cloning(tmp_path / "one", data, start=frozen()).iteration == 1
 
@@ -102,20 +101,20 @@ def test_a_resumed_reflow_has_the_teacher_that_it_began_with(tmp_path, data):
     training = cloning(tmp_path, data, coupling=ReflowCoupling(teachers[0], nfe=1))
     training.step()
     training._save()
-    with pytest.raises(ValueError, match="coupling"):
+    with raises(ValueError, "coupling"):
         cloning(tmp_path, data, coupling=ReflowCoupling(teachers[1], nfe=1))
 
 
 def test_regression_and_a_start_on_the_way_do_not_go_together():
     actor = WarmPriorActor(network(), GaussianPrior(H), start=frozen(), max_nfe=1)
-    with pytest.raises(ValueError, match=r"t = 0 alone.*without a start point.*Halfway"):
+    with raises(ValueError, "t = 0", "Halfway"):
         FlowMatchingLoss(actor, times="start")
 
 
 def test_nothing_is_withheld_behind_the_back_of_a_network_that_has_seen_it(data):
     buffer = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=1, see_history=True)
     buffer.append_transform(WithheldHistory(1.0))
-    with pytest.raises(ValueError, match="put WithheldHistory before HistoryObservation"):
+    with raises(ValueError, "WithheldHistory", "HistoryObservation"):
         buffer.sample()
 
 
@@ -129,5 +128,5 @@ def test_an_argument_called_name_is_refused():
         def __init__(self, radius): ...
 
     for thing, argument in ((Named("x"), "name"), (Forgetful(1.0), "radius")):
-        with pytest.raises(TypeError, match=argument):
+        with raises(TypeError, argument):
             thing.config()
