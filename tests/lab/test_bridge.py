@@ -31,8 +31,8 @@ def test_bridge_of_gaussians(sigma):
     """Pairs, path and velocity against the closed form of the bridge."""
     s0, s1, mean = 1.0, 0.5, 2.0
     torch.manual_seed(0)
-    a0 = s0 * torch.randn(256 * 100, 1, 1)
-    a1 = mean + s1 * torch.randn(256 * 100, 1, 1)
+    a0 = s0 * torch.randn(256 * 50, 1, 1)
+    a1 = mean + s1 * torch.randn(256 * 50, 1, 1)
     couple = BridgeCoupling(sigma, observation_weight=0.0)
     source, target = couple(a0, a1)
     assert target is a1

@@ -14,8 +14,6 @@ from tests.toy_env import mlp_actor
 from warmprior import PastPrior, PreviewPrior
 
 N = 20_000
-
-
 actor = partial(mlp_actor, steps=1)
 
 

@@ -266,7 +266,7 @@ def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
     assert started.wait(60)
     seen = set()
     try:
-        for _ in range(200):
+        for _ in range(100):
             actor = load_policy(tmp_path)
             seen.add(actor.prior.sigma)
             assert (actor.network.head[1].weight == actor.prior.sigma).all()
