@@ -66,8 +66,6 @@ def test_names_are_defined_or_said_to_be_given(text):
 
 
 COMMAND = re.compile(r"^(?:torchrun [^\n]*? )?(?:python )?(-m warmprior|benchmarks/\w+\.py)(.*)$", re.M)
-
-
 WITH_SUBCOMMANDS = ("-m warmprior", "benchmarks/demonstrations.py")
 
 

@@ -37,8 +37,6 @@ class Without:
 
 sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
 """
-
-
 TRAINED = """
 import torch
 from tensordict import TensorDict

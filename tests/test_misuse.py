@@ -18,8 +18,6 @@ PRIOR = PastPrior(4)
 CONFIG = TrainingConfig(iterations=1, batch_size=4, checkpoints=1)
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 SHORT = {"network": NETWORK, "training": CONFIG, "description": None}
-
-
 actor = partial(mlp_actor, PRIOR, 1, 3, 1)
 
 

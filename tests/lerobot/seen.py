@@ -1,4 +1,5 @@
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -6,21 +7,10 @@ import torch
 from tests.lerobot.tiny import LENGTH
 
 
-class Seen:
-    """Inputs ``x`` and outputs of the network: velocities, or actions where it predicts those.
-
-    ``t`` where it is an argument by this name.
-    """
-
-    def __init__(self) -> None:
-        self.x: list[torch.Tensor] = []
-        self.out: list[torch.Tensor] = []
-        self.t: list[Any] = []
-
-
 @contextmanager
 def watch(family: str, policy: Any) -> Any:
-    seen, handles = Seen(), []
+    """Inputs ``x`` and outputs of the network (velocities, or actions), and ``t`` where it has that name."""
+    seen, handles = SimpleNamespace(x=[], out=[], t=[]), []
 
     def before(module: Any, take: Any) -> None:
         def hook(module: Any, args: Any, kwargs: Any) -> None:

@@ -2,16 +2,8 @@ import pytest
 import torch
 
 from tests.errors import raises
+from tests.toy_env import stirred
 from warmprior import VelocityMLP
-
-
-def perturbed(network):
-    """Modulation starts from no effect; give it some."""
-    with torch.no_grad():
-        for block in network.blocks:
-            for layer in (block.scale, block.shift):
-                layer.weight.normal_(std=0.1)
-    return network
 
 
 def test_modulation_starts_from_no_effect():
@@ -20,13 +12,13 @@ def test_modulation_starts_from_no_effect():
     a, o = torch.randn(1, 4, 2).expand(5, 4, 2), torch.randn(1, 2, 3).expand(5, 2, 3)
     velocity = network(torch.linspace(0, 1, 5), a, o)
     torch.testing.assert_close(velocity, velocity[:1].expand_as(velocity))
-    velocity = perturbed(network)(torch.linspace(0, 1, 5), a, o)
+    velocity = stirred(network)(torch.linspace(0, 1, 5), a, o)
     assert (velocity.diff(dim=0).abs() > 1e-4).flatten(1).any(1).all()
 
 
 def test_every_input_matters():
     torch.manual_seed(0)
-    network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16))
+    network = stirred(VelocityMLP(2, 3, 4, hidden_dim=16))
     inputs = [torch.randn(1, *shape, requires_grad=True) for shape in ((), (4, 2), (2, 3))]
     network(*inputs).square().sum().backward()
     assert all((value.grad.abs() > 0).all() for value in inputs)
@@ -35,7 +27,7 @@ def test_every_input_matters():
 def test_blocks_by_hand():
     """Adaptive layer norm: x + f(scale norm(x) + shift), with numbers of its own."""
     torch.manual_seed(0)
-    network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16, num_blocks=1))
+    network = stirred(VelocityMLP(2, 3, 4, hidden_dim=16, num_blocks=1))
     block, time, x = network.blocks[0], torch.randn(5, 32), torch.randn(5, 16)
     scale, shift = (time @ m.weight.T + m.bias for m in (block.scale, block.shift))
     norm = (x - x.mean(1, keepdim=True)) / (x.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()

@@ -8,6 +8,7 @@ from torch import nn
 from torch.nn import functional
 
 from tests.errors import raises
+from tests.toy_env import stirred
 from warmprior import AdaLNTransformer, ChiTransformer
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config
@@ -55,14 +56,6 @@ def modulated(**options):
     return tiny(kind=AdaLNTransformer, **options)
 
 
-def stirred(network):
-    """The same with modulations that do something, as after a training."""
-    for block in network.blocks:
-        nn.init.normal_(block.modulate.weight, std=0.3)
-        nn.init.normal_(block.modulate.bias, std=0.3)
-    return network
-
-
 def test_modulation_starts_without_effect():
     network, a = modulated(), torch.randn(5, 4, 2)
     expected = network.head(network.embed_action(a) + network.action_position)
@@ -71,7 +64,7 @@ def test_modulation_starts_without_effect():
 
 
 def test_modulated_block_beside_pytorch_s_attention():
-    block = stirred(modulated()).blocks[0]
+    block = stirred(modulated(), by=0.3).blocks[0]
     x, condition = torch.randn(5, 4, 24), torch.randn(5, 24)
     shift, scale, gate, shift2, scale2, gate2 = block.modulate(condition).unsqueeze(1).chunk(6, -1)
     attention = nn.MultiheadAttention(24, 3, batch_first=True)
@@ -86,7 +79,7 @@ def test_modulated_block_beside_pytorch_s_attention():
 
 
 def test_every_action_sees_every_other_the_observations_and_the_time():
-    network = stirred(modulated())
+    network = stirred(modulated(), by=0.3)
     t, a, o = torch.tensor([0.3]), torch.randn(1, 4, 2), torch.randn(1, 2, 3)
     inputs = [value.requires_grad_() for value in (t, a, o)]
     out = network(*inputs)

@@ -23,8 +23,6 @@ from warmprior.modules.prior import Source
 H = 3
 LENGTHS = (7, 4)
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
-
-
 actor_for = partial(mlp_actor, steps=1)
 
 

@@ -26,8 +26,6 @@ from warmprior import (
 )
 
 H, D_A, D_O, TO = 3, ACTION_DIM, 5, 2
-
-
 make_actor = partial(mlp_actor, observation_dim=D_O, hidden_dim=16)
 
 

@@ -28,8 +28,6 @@ from warmprior.training import play_episode
 H, TO, D_O, DELTA = 3, 2, 2 + ACTION_DIM, 0.5
 LENGTHS = (7, 4)
 WHERE = {keys.NOISE: ("next", "decoded", "noise"), keys.CHUNK: ("next", "decoded", "chunk")}
-
-
 make_actor = partial(mlp_actor, nfe=2, clip=1.0)
 
 
