@@ -71,7 +71,7 @@ def ray_rounds(
         cores = int(ray.cluster_resources().get("CPU", 0))
         if cores < collectors:
             raise ValueError(
-                f"--collectors {collectors}: the cluster has {cores} CPUs, and each collector needs one"
+                f"--collectors {collectors} need a CPU each, and the cluster has {cores}: choose fewer"
             )
         makers: list[Any] = [
             partial(_make_env, make_env, seed + EPISODES_APART * i, list(sys.path)) for i in range(collectors)

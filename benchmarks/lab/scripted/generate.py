@@ -80,7 +80,7 @@ def generate_demonstrations(
             "(download_robomimic, or --download)"
         )
     if style not in _STYLES:
-        raise ValueError(f"style must be {' or '.join(map(repr, _STYLES))}, got {style!r}")
+        raise ValueError(f"style is {' or '.join(map(repr, _STYLES))}, got {style!r}")
     last_seed = EVALUATION_SEED // SEEDS_PER_FILE - 1
     if not 0 <= seed <= last_seed:
         raise ValueError(f"seed must be between 0 and {last_seed}, got {seed}")

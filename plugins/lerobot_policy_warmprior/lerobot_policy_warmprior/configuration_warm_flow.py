@@ -127,7 +127,7 @@ class WarmFlowConfig(PreTrainedConfig):
         mode = self.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
         if self.image_features and mode != NormalizationMode.IDENTITY:
             raise ValueError(
-                f"warm_flow scales pixels by itself: set its VISUAL normalisation to IDENTITY, not to "
+                f"warm_flow scales pixels by itself: set its VISUAL normalisation to IDENTITY, not "
                 f"{mode.value}"
             )
         for name, feature in self.image_features.items():
