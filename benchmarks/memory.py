@@ -45,12 +45,13 @@ def main(argv: list[str] | None) -> None:
     for method, group in gains.groupby("method", sort=False):
         axis.scatter(group.memory_gain, 100 * group.gain, 40, color=colors[method], label=method)
     axis.axhline(0, color="0.6", lw=0.8)
+    axis.locator_params(axis="x", nbins=5)
     axis.set_xlabel("memory gain (0: past ignored, 1: past copied)")
     axis.set_ylabel("gain in success (points)")
     firsts = dict.fromkeys(rows.method.iloc[0] for rows in summaries)
     save(figure, args.out, f"Gain over {' or '.join(firsts)}", 12)
 
-    text = table(gains, ["setting", "nfe", "method"], ["memory_gain", "gain"])
+    text = table(gains, ["setting", "nfe", "temperature", "method"], ["memory_gain", "gain"])
     print(text, f"\nPicture: {args.out}", sep="")
 
 

@@ -41,22 +41,23 @@ from warmprior.transforms.history import HistoryObservation
 
 
 class AsyncExecutor:
-    """A runner of a policy next to a control loop: it computes the next chunk while this one is executed.
+    """Runs a policy alongside a control loop: the next chunk is computed while the current one is executed.
 
     Every ``execute`` control steps a decision begins in a thread, with the observation of that step. Until
     its chunk is ready, the robot continues the old one; the new chunk takes effect at the position that the
-    robot has reached. The policy expects the largest delay of the last decisions (``("rtc",
-    "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is always
-    current, even if a decision is late: it holds each executed action and the rest of the chunk, which is
-    empty once the chunk is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with
-    ``latency`` the actions are equal.
+    robot has reached. The policy expects the largest delay of the recent decisions (``("rtc", "delay")``, for
+    :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is always current, even if a
+    decision is late: it holds each executed action and the rest of the chunk, which is empty once the chunk
+    is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with ``latency`` both return
+    the same actions.
 
     The first step of an episode waits for its chunk. Later, if no action is left, :meth:`act` waits for at
     most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again. Several threads
     can share an executor: their calls take turns.
 
     Normaliser, stack of observations, and the names and sizes of observations are the policy's. Camera images
-    may have any size: they are resized to that of the training, of which the encoder takes the central crop.
+    may have any size: they are resized to the size of the training images, and the encoder takes the central
+    crop.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, a :class:`~warmprior.lerobot.LeRobotActor`, or any module
@@ -68,10 +69,10 @@ class AsyncExecutor:
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.
         control_rate: control steps per second.
-        window: number of last decisions whose largest delay is expected.
+        window: number of recent decisions; the next one expects the largest of their delays.
         observation_steps: ``To``; that of the actor's network by default, or 2.
-        normalizer: converts raw observations and actions; the actor's own by default. Without one, they are
-            in the policy's units, as for ``actor.replace(normalizer=None)``.
+        normalizer: converts raw observations and actions; the actor's own by default. Without one
+            (``actor.replace(normalizer=None)``), both are in the policy's units.
         timeout: seconds to wait for a late chunk once no action is left; ``None`` waits without limit.
         latency: simulated delay: chunks are computed in the calling thread and take effect this many control
             steps later.
@@ -79,7 +80,7 @@ class AsyncExecutor:
         action_dim: ``d_a``; that of the actor's network by default.
 
     Raises:
-        ValueError: if numbers do not fit each other, an argument is missing that the actor does not provide,
+        ValueError: if numbers are inconsistent, an argument is missing that the actor does not provide,
             or the normaliser lacks observations or actions.
 
     Examples:
@@ -172,9 +173,9 @@ class AsyncExecutor:
         return max(self.delays, default=self._expected)
 
     def reset(self) -> None:
-        """Begin another episode.
+        """Begin a new episode.
 
-        A decision that is being computed is completed, advances the generator and is discarded.
+        A decision in progress runs to its end and advances the generator; its chunk is discarded.
         """
         with self._lock:
             if self._pending is not None:
@@ -194,7 +195,7 @@ class AsyncExecutor:
 
         Raises:
             KeyError: if an entry is missing; the executor's state is then unchanged.
-            ValueError: if an entry has another shape or is not an image; the state is then unchanged.
+            ValueError: if an entry has the wrong shape or is not an image; the state is then unchanged.
             TimeoutError: if no action is left, and the next chunk is not ready in time.
             RuntimeError: if the executor is closed.
             Exception: the policy's own error, once no action is left. Until then, and at every further call,

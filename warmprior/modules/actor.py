@@ -151,7 +151,7 @@ def check_usual_keys(policy: Any, whose: str) -> None:
 
 
 class WarmPriorActor(TensorDictModuleBase):
-    """A flow-matching policy from any source: ``(observation, history) -> (loc, warm, noise, chunk)``.
+    """A flow-matching policy with any source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
     It composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history
     that it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it
@@ -168,9 +168,10 @@ class WarmPriorActor(TensorDictModuleBase):
             directly after the base environment.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             (``python -m warmprior evaluate FOLDER``).
-        generator: source of the sampler's randomness, also per call: ``actor(data, generator=...)``.
-        observation_key: key of the observation, ``[*B, To, d_o]``, or of several nested under it;
-            :data:`warmprior.keys.CONDITIONED` if the network sees the last actions
+        generator: random generator of the sampler, which can also be passed per call: ``actor(data,
+            generator=...)``.
+        observation_key: key of the observation, ``[*B, To, d_o]``, or of a group of observations nested under
+            it; :data:`warmprior.keys.CONDITIONED` if the network sees the last actions
             (:class:`~warmprior.HistoryObservation`).
         history_key: key of the history.
         source_key: where ``"loc"``, ``"warm"`` and ``"noise"`` are written.

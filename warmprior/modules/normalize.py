@@ -15,7 +15,7 @@ from warmprior import keys
 
 
 class Normalizer(nn.Module):
-    """A map of every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).
+    """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
     Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
     above 1) count as constant and are only shifted. The statistics are buffers.
@@ -64,7 +64,7 @@ class Normalizer(nn.Module):
         *,
         units: Mapping[NestedKey, Tensor] | None = None,
     ) -> Normalizer:
-        """Take the minimum and maximum over all steps of a dataset.
+        """Return a normaliser with the minimum and maximum over all steps of a dataset.
 
         Args:
             data: flat steps ``[N]`` with raw ``[N, d]`` entries.
@@ -141,7 +141,7 @@ class Normalizer(nn.Module):
         return transforms
 
     def config(self) -> dict[str, Any]:
-        """Return the keys and their shapes as JSON holds them; the values themselves are buffers."""
+        """Return the keys and their shapes in JSON form; the values themselves are buffers."""
         return {"shapes": [[key, list(self.loc(key).shape)] for key in self.keys]}
 
     @classmethod

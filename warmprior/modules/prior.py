@@ -25,7 +25,7 @@ def noise_factor(temperature: float | None) -> float:
 
 @dataclass(frozen=True)
 class Source:
-    r"""A source :math:`a_0 = \mu + s \varepsilon`, as :meth:`Prior.distribution` gives it.
+    r"""A source :math:`a_0 = \mu + s \varepsilon`, returned by :meth:`Prior.distribution`.
 
     Attributes:
         loc: :math:`\mu`, ``[*B, P, d_a]``, normalised action space.

@@ -26,7 +26,7 @@ Weighting = Literal["velocity", "standardised"]
 
 
 class FlowMatchingLoss(LossModule):
-    r"""The loss of conditional flow matching with the actor's own source (Algorithm 1, training).
+    r"""The conditional flow-matching loss with the actor's own source (Algorithm 1, training).
 
     For each window it draws :math:`a_0` from the prior, pairs it with :math:`a_1`, draws :math:`t \sim U(0,
     1)`, sets :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regresses :math:`v_\theta(t, a_t, o)` on
@@ -51,10 +51,10 @@ class FlowMatchingLoss(LossModule):
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that all
             times, positions and dimensions have equal weight, as in EDM (Karras et al., 2022, Table 1); it is
             the default for a :class:`PreconditionedNetwork`. With ``"velocity"``, a standard normal source
-            and data of deviation :math:`s`, errors at ``t = 0``, the time of one-step samplers, have
-            :math:`s^2` times the weight of those at ``t = 1``.
+            and data with standard deviation :math:`s`, errors at ``t = 0``, the time of one-step samplers,
+            have :math:`s^2` times the weight of those at ``t = 1``.
         interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or linear.
-        reduction: ``"mean"`` over coordinates that count (Algorithm 1 divided by their number, or by the sum
+        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number, or by the sum
             of their weights), ``"sum"`` (Algorithm 1) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: draws ``t`` and :math:`a_0`; by default that of the actor's sampler.
 

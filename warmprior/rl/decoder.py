@@ -37,15 +37,15 @@ class PriorDecoder(TensorDictModuleBase):
     ``apply`` and ``reset_parameters_recursive`` of the sequence reach the policy too.
 
     Args:
-        actor: the policy, which is copied, or an object with the same parts, such as
+        actor: the policy, which is copied, or an object with the same interface, such as
             :class:`~warmprior.lerobot.LeRobotActor`.
-        delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
+        delta: half the width of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
 
     Raises:
         ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` only or is
-            guided, or ``nfe`` does not fit it.
+            guided, or it does not allow ``nfe``.
         KeyError: (when called) if an input key is missing.
 
     Examples:

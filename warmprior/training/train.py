@@ -123,17 +123,17 @@ def train_policy(
         description: label of the progress bar; no bar if ``None``.
         progress: called with the number of iterations, at the start and after each iteration.
         **sampling: further options of :class:`~warmprior.Sampling`, saved with the policy, such as
-            ``max_nfe`` for a field that is trained at few times.
+            ``max_nfe`` for a field trained at only a few values of ``t``.
 
     Returns:
         The last policy, with averaged weights, on the CPU, with the demonstrations' normaliser. Use
         :func:`~warmprior.policy_transforms` to build the environment that it acts in.
 
     Raises:
-        TypeError: if the demonstrations or the prior have another type.
+        TypeError: if the demonstrations or the prior have the wrong type.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
-        ValueError: if the demonstrations have another form, or the folder holds another training.
+        ValueError: if the demonstrations have the wrong form, or the folder holds a different training.
 
     Examples:
         >>> import torch

@@ -51,8 +51,8 @@ def policy_transforms(
             :class:`AbsoluteActions`; it is copied.
         images: transform that adds images to observations, such as :class:`CameraImages`; it is copied.
         observation_steps: ``To``; by default that of the policy's network, or 2.
-        execute: actions executed per decision; by default ``H``, or with a ``delay`` as many as predictions
-            allow.
+        execute: actions executed per decision; by default ``H``, or, with a ``delay``, as many as the
+            prediction allows.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 if the
             policy has :class:`~warmprior.RealTimeChunking`; otherwise no delay is written.
         gamma: discount per control step inside a chunk.
@@ -64,7 +64,7 @@ def policy_transforms(
 
     Raises:
         TypeError: if ``policy`` is neither a policy nor a prior.
-        ValueError: if the normaliser lacks the action, or numbers do not fit each other.
+        ValueError: if the normaliser lacks the action, or numbers are inconsistent.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv

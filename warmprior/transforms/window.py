@@ -250,11 +250,12 @@ def window_replay_buffer(
         observation_steps: ``To``.
         see_history: True if the network sees the last actions.
         withhold: share of the windows whose history is withheld.
-        generator: chooses the windows, and those withheld; PyTorch's global generator by default.
+        generator: draws the windows, and those whose history is withheld; PyTorch's global generator by
+            default.
         observation_key: key of the observation.
 
     Raises:
-        ValueError: if ``batch_size < 1``, or for the reasons of :class:`ActionWindow`.
+        ValueError: if ``batch_size < 1``, or :class:`ActionWindow` rejects the data.
 
     Examples:
         >>> from warmprior import PreviewPrior, window_replay_buffer
