@@ -238,7 +238,7 @@ def train(args: argparse.Namespace) -> None:
         spread = float(left_out["action"].var(0, correction=0).mean())
         number = count - task.facts["demonstrations"]
         print(
-            f"mean squared error of normalised actions (from -1 to 1) on {number} held-out demonstrations; "
+            f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
             f"the mean action has {spread:.4f}:"
         )
         steps = options.network.observation_steps

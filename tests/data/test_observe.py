@@ -101,7 +101,7 @@ def test_a_robot_without_a_simulator(tmp_path, capsys):
     argv = ["train", str(path), "--out", str(tmp_path / "out"), "--iterations", "2", "--hidden-dim", "8"]
     chosen = ["--observation-keys", "joints", "gripper", "--held-out", "1"]
     assert main([*argv, *chosen]) == 0
-    assert "1 demonstrations" in capsys.readouterr().out
+    assert "(1)" in capsys.readouterr().out
     seen = ["--image-keys", "wrist_image", "--encoder", "small", "--crop-size", "20"]
     assert main([*argv, *chosen, *seen, "--out", str(tmp_path / "seen")]) == 0
     for wrong in (["--observation-keys", "legs"], ["--image-keys", "front_image"]):
