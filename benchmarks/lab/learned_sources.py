@@ -38,7 +38,7 @@ class Learner(nn.Module):
     heads: ClassVar[int] = 1  # number of chunks that the network predicts
     chunk_length: int
     chunk_dim: int  # numbers in a chunk, H d_a
-    seen_dim: int  # numbers in the network's input
+    input_dim: int  # numbers in the network's input
 
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
         """Set the widths and make the networks; without widths, only note the width of hidden layers."""
@@ -48,12 +48,12 @@ class Learner(nn.Module):
             self.action_dim, self.observation_dim, self.observation_steps = widths
             self.chunk_dim = self.chunk_length * self.action_dim
             observed = self.sees_observation * self.observation_steps * self.observation_dim
-            self.seen_dim = self.sees_history * (self.chunk_dim + 1) + observed
+            self.input_dim = self.sees_history * (self.chunk_dim + 1) + observed
             self.build()
             self.requires_grad_(False)
 
     def build(self) -> None:
-        self.network = self.mlp(self.seen_dim, self.heads * self.chunk_dim)
+        self.network = self.mlp(self.input_dim, self.heads * self.chunk_dim)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """Return the loss of the networks on windows; by default the mean squared error."""
@@ -66,8 +66,8 @@ class Learner(nn.Module):
     def mlp(self, inputs: int, outputs: int) -> MLP:
         return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
 
-    def seen(self, history: TensorDictBase, observation: Any) -> Tensor:
-        """Return the input of the network, ``[*B, seen_dim]``."""
+    def network_input(self, history: TensorDictBase, observation: Any) -> Tensor:
+        """Return the input of the network, ``[*B, input_dim]``."""
         parts = [observation.flatten(-2)] if self.sees_observation else []
         if self.sees_history:
             full = history["steps"] >= self.chunk_length
@@ -78,7 +78,7 @@ class Learner(nn.Module):
 
     def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Return the predicted chunks, ``[*B, H, d_a]``, with several heads ``[*B, heads H, d_a]``."""
-        return self.network(self.seen(history, observation)).unflatten(-1, (-1, self.action_dim))
+        return self.network(self.network_input(history, observation)).unflatten(-1, (-1, self.action_dim))
 
 
 class LearnedPrior(PastPrior, Learner, abstract=True):
@@ -222,8 +222,8 @@ class CVAEPrior(LearnedPrior):
         super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
 
     def build(self) -> None:
-        self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
-        self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
+        self.encoder = self.mlp(self.input_dim + self.chunk_dim, 2 * self.latent_dim)
+        self.decoder = self.mlp(self.input_dim + self.latent_dim, self.chunk_dim)
 
     def decode(self, inputs: Tensor, z: Tensor) -> Tensor:
         return self.decoder(torch.cat([inputs, z], -1)).unflatten(-1, (-1, self.action_dim))
@@ -232,7 +232,7 @@ class CVAEPrior(LearnedPrior):
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
         """Return a source that decodes a new latent for every sample; it is Gaussian given the latent."""
-        source, inputs = super().distribution(history, observation), self.seen(history, observation)
+        source, inputs = super().distribution(history, observation), self.network_input(history, observation)
 
         def decoded(generator: torch.Generator | None, temperature: float) -> Tensor:
             like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
@@ -243,7 +243,7 @@ class CVAEPrior(LearnedPrior):
         return Drawn(source.loc, source.scale, source.warm, by=decoded)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        inputs = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        inputs = self.network_input(windows[keys.HISTORY], windows[keys.OBSERVATION])
         inside = ~windows[keys.IS_PAD].unsqueeze(-1)
         encoded = self.encoder(torch.cat([inputs, (windows[keys.CHUNK] * inside).flatten(-2)], -1))
         mean, log_variance = encoded.chunk(2, -1)

@@ -190,7 +190,7 @@ class Method:
 
     text: str  # `past,correlation=0.5`, or package.module:Class of a prior of your own
     chunk_length: int
-    sigma_asked: float | None = None  # ignored if the method takes none
+    sigma_option: float | None = None  # ignored if the method takes none
     parts: Composition = field(init=False, repr=False)
     arguments: dict[str, Any] = field(init=False, repr=False)
 
@@ -207,10 +207,10 @@ class Method:
             defaults |= _parameters(part)
         defaults |= {"sigma": parts.prior.default_sigma} if "sigma" in defaults else {}
         typed_options = options_of(self.text)
-        if self.sigma_asked is not None and "sigma" in defaults:
+        if self.sigma_option is not None and "sigma" in defaults:
             if "sigma" in typed_options:
-                raise ValueError(f"--prior {self.text} and --sigma {self.sigma_asked:g} both set sigma")
-            typed_options["sigma"] = float(self.sigma_asked)
+                raise ValueError(f"--prior {self.text} and --sigma {self.sigma_option:g} both set sigma")
+            typed_options["sigma"] = float(self.sigma_option)
         changed = {k: v for k, v in sorted(typed_options.items()) if v is not None and v != defaults.get(k)}
         object.__setattr__(self, "arguments", changed)
         try:
@@ -227,7 +227,7 @@ class Method:
 
     def __reduce__(self) -> Any:
         # A worker process imports a user's own prior again, by its typed name.
-        return Method, (self.text, self.chunk_length, self.sigma_asked)
+        return Method, (self.text, self.chunk_length, self.sigma_option)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Method) and self.config() == other.config()
