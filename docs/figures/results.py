@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from pages import write
-from pandas import DataFrame, Series, concat, read_json
+from pandas import DataFrame, Series, concat
 from shared import (
     CORRELATED,
-    DATA,
     DOCS,
     GAUSSIAN,
     OPERATORS,
@@ -33,6 +32,7 @@ from shared import (
     finish,
     lines,
     read,
+    read_played,
     save,
     wilson,
 )
@@ -240,9 +240,9 @@ def table() -> str:
 
 def papers_settings() -> DataFrame:
     """Return success in the state settings of the paper's Table 1, a row per training, NFE and source."""
-    longest = read_json(DATA / "square_mh_80000.jsonl", lines=True)
-    plain = (longest["options"] == "") & (longest["sigma"] == longest["prior"].map(PAPER_DEFAULT_SIGMA))
-    longest = longest[plain].rename(columns={"data": "style", "prior": "source"})
+    longest = read_played("square_mh_80000")
+    own_noise = (longest["sigma"] == longest["prior"].map(PAPER_DEFAULT_SIGMA)) & (longest["noise"] == 1)
+    longest = longest[(longest["options"] == "") & own_noise].rename(columns={"data": "style"})
     keys = ["task", "style", "iterations", "source", "nfe"]
     longest = longest.groupby(keys, as_index=False).agg(
         success=("success_rate", lambda rates: 100 * rates.mean()), seeds=("seed", "nunique")

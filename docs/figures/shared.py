@@ -51,7 +51,8 @@ def read_played(name: str) -> DataFrame:
     """Return the rows of a run, with source, factor of its noise, and the outcome of every episode."""
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     options = rows["options"].where(rows["options"] == "", "," + rows["options"])
-    rows = rows.assign(source=rows["prior"] + options, noise=rows.get("temperature", Series(1.0, rows.index)))
+    noise = rows.get("temperature", Series(1.0, rows.index)).fillna(1.0)  # 1 if unnamed
+    rows = rows.assign(source=rows["prior"] + options, noise=noise)
     return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
 
 
