@@ -159,8 +159,8 @@ class Ray:
 class Jobs:
     """The jobs of a run.
 
-    Jobs start in the order in which they are ready. Only the last trainings go before all others, because
-    they take longest and would otherwise run alone at the end.
+    Of the jobs that are ready, the first submitted starts. Only the last trainings go before all others,
+    because they take longest and would otherwise run alone at the end.
     """
 
     def __init__(self, run: Run) -> None:

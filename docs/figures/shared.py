@@ -33,8 +33,8 @@ SOURCES = {  # label, colour and marker in charts
     "forecast": ("learned, from both", "0.2", "*"),
     "regression": ("regression", "0.2", "p"),
     "mip": ("MIP", "#a6761d", "s"),
-    "mip-past": ("MIP, WP-Past", "#a6761d", "D"),
-    "mip-past,correlation=0.5": ("MIP, WP-Past, correlated noise", "#a6761d", "P"),
+    "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
+    "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
 }
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 OPERATORS = {"ph": "one operator", "mh": "six operators"}

@@ -29,7 +29,7 @@ class WarmConfigMixin:
         prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
         prior_chunk: ``H``, actions that the prior remembers; by default as many as the chunk allows.
         sigma_unit: unit of sigma: ``model`` (normalised actions) or ``std`` (standard deviations of the
-        data).
+            data).
         action_std: standard deviations of actions for ``std``; taken from the dataset, and saved.
         cold_probability: share of the training windows whose history is withheld.
     """
