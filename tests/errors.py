@@ -12,9 +12,18 @@ def raises(error, fact, *more):
     with pytest.raises(error) as caught:
         yield caught
     text = str(caught.value)
-    missing = [one for one in (fact, *more) if not re.search(_words(one), text)]
-    assert not missing, f"{missing} missing in: {text}"
+    lacks = missing(text, fact, *more)
+    assert not lacks, f"{lacks} missing in: {text}"
+
+
+def missing(text, *facts):
+    """The facts that a text lacks as whole words; a number is not found inside another one."""
+    return [fact for fact in facts if not re.search(_words(str(fact)), text)]
 
 
 def _words(fact):
-    return re.sub(r"^\b|\b$", r"\\b", re.escape(str(fact)))
+    assert fact, "an empty fact is in every text"
+    # 3 is neither in -3 and 0.3 nor in 3.5.
+    before = r"(?<![\w.-])" if fact[0].isdigit() else r"\b" if re.match(r"\w", fact) else ""
+    after = r"(?!\w|\.\d)" if fact[-1].isdigit() else r"\b" if re.search(r"\w$", fact) else ""
+    return before + re.escape(fact) + after

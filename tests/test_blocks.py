@@ -35,9 +35,7 @@ PROGRAMS = [pytest.param(text, id=name) for name, text in BLOCKS if not GIVEN.ma
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """A folder with the files that the pages name."""
-    (tmp_path / "core").mkdir()
     write_robomimic_file(tmp_path / "square.hdf5", masks={"train": [0, 1]})
-    write_robomimic_file(tmp_path / "core" / "coffee_d0.hdf5", [3] * 10, task="coffee_d0")
     monkeypatch.chdir(tmp_path)
     # What other tests have defined would not be there in a fresh process.
     own = {n: kind for n, kind in Prior.classes.items() if kind.__module__.startswith(("warmprior.", "lab."))}

@@ -54,7 +54,7 @@ def test_what_train_policy_cannot_take():
         ({"action": 1}, PRIOR, TypeError, "dict"),
         (TensorDict(dict(steps().items()), []), PRIOR, ValueError, "steps"),
         (steps(), PastPrior, TypeError, "PastPrior"),
-        (steps().exclude("episode"), PRIOR, KeyError, "'episode'"),
+        (steps().exclude("episode"), PRIOR, KeyError, "missing: ['episode']"),
     ):
         with raises(error, fact):
             train_policy(data, prior)

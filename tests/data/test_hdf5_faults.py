@@ -99,7 +99,7 @@ def test_values_whose_storage_ends_before_they_do(square_file):
     content, before = path.read_bytes(), struct.pack("<2Q", place, 5 * 7 * 8)
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<2Q", place, 5 * 7 * 8 - 8)))
-    with raises(DatasetError, "square.hdf5", "data/demo_1/actions"):
+    with raises(DatasetError, "square.hdf5", "data/demo_1/actions", "never written"):
         RobomimicDemonstrations(path)
 
 

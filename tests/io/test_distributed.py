@@ -33,7 +33,7 @@ def test_alone(monkeypatch):
 def test_several_processes_share_no_gpu(under_torchrun, two_gpus):
     with raises(ValueError, 3, 2):
         check_device("cuda")
-    with raises(ValueError, "--device cuda"):
+    with raises(ValueError, "--device cuda:1", "write --device cuda"):
         check_device("cuda:1")
     check_device("cpu")
 

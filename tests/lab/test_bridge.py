@@ -60,5 +60,5 @@ def test_the_loss_takes_the_path_of_the_coupling():
     assert loss.interpolant.config() == BridgeInterpolant(0.2).config()
     with raises(ValueError, "straight path"):
         FlowMatchingLoss(actor, coupling=BridgeCoupling(0.2), objective="l1")
-    with raises(ValueError, "sigma", 0):
+    with raises(ValueError, "sigma", "got 0.0"):
         BridgeCoupling(0.0)

@@ -173,10 +173,11 @@ def test_set_keys(nested):
 
 def test_windows_that_do_not_fit():
     actor, data = actor_for(PastPrior(H)), sample(PastPrior(H), 6)
-    for missing in (("vla_action", "chunk"), "history", ("history", "steps"), "observation"):
-        name = missing if isinstance(missing, str) else missing[-1]
-        with raises(KeyError, f"'{name}'"):
+    for missing in (("vla_action", "chunk"), "history", "observation"):
+        with raises(KeyError, f"missing: [{missing!r}]", "window_replay_buffer"):
             loss_of(actor, data.exclude(missing))
+    with raises(KeyError, "missing: ['steps']", "ActionWindow"):
+        loss_of(actor, data.exclude(("history", "steps")))
     for made_for in (PreviewPrior(H), PastPrior(H - 1)):
         other = sample(made_for, 6)
         with raises(ValueError, "('vla_action', 'chunk')", made_for.prediction_length, "PastPrior", H):

@@ -90,11 +90,11 @@ def test_another_policy():
     with raises(ValueError, "t = 0"):  # regression, which has no source space
         PriorDecoder(make_actor(GaussianPrior(H), max_nfe=1), delta=0.5)
     decoder = PriorDecoder(make_actor(PastPrior(H)), delta=0.5)
-    with raises(ValueError, "anchor", "[4, 6, 2]", "[4, 3, 2]"):
+    with raises(ValueError, "anchor", "has shape [4, 6, 2]", "expected [4, 3, 2]"):
         decoder(batch(PreviewPrior(H), 4))
     data = batch(PastPrior(H), 4)
     data["prior", "delta"] = data["prior", "delta"].flatten(-2)
-    with raises(ValueError, "delta", "[4, 6]"):
+    with raises(ValueError, "delta", "has shape [4, 6]", "expected [4, 3, 2]"):
         decoder(data)
 
 
