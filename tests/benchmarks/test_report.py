@@ -229,7 +229,7 @@ def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
     argv = [str(tmp_path / name) for name in ("one", "two")]
     assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert lines[2:] == ["| Square-PH | 1 | WP-Past | 0.250 | +30.0% |"] and is_png(tmp_path / "a.png")
+    assert lines[2:] == ["| Square-PH | 1 | 1 | WP-Past | 0.250 | +30.0% |"] and is_png(tmp_path / "a.png")
     assert memory.main([str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.endswith("results.jsonl: no such file\n")
     (tmp_path / "one" / "results.jsonl").write_text('{"task": "navigation"}\n')

@@ -55,9 +55,9 @@ class AsyncExecutor:
     most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again. Several threads
     can share an executor: their calls take turns.
 
-    Normaliser, stack of observations, and the names and sizes of observations are the policy's. Camera images
-    may have any size: they are resized to the size of the training images, and the encoder takes the central
-    crop.
+    The normaliser, the number of stacked observations, and the observations' names and sizes come from the
+    policy. Camera images may have any size: they are resized to the size of the training images, and the
+    encoder takes the central crop.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, a :class:`~warmprior.lerobot.LeRobotActor`, or any module
@@ -69,7 +69,7 @@ class AsyncExecutor:
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.
         control_rate: control steps per second.
-        window: number of recent decisions; the next one expects the largest of their delays.
+        window: the expected delay is the largest of this many recent ones.
         observation_steps: ``To``; that of the actor's network by default, or 2.
         normalizer: converts raw observations and actions; the actor's own by default. Without one
             (``actor.replace(normalizer=None)``), both are in the policy's units.

@@ -17,8 +17,8 @@ from warmprior import keys
 class Normalizer(nn.Module):
     """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
-    Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
-    above 1) count as constant and are only shifted. The statistics are buffers.
+    A dimension counts as constant, and is only shifted, if half its range is at most ``1e-5 * max(1,
+    |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers.
 
     Args:
         low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.

@@ -184,15 +184,15 @@ class PreconditionedNetwork(VelocityNetwork):
     a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
     Eq. 7), whose constants assume zero means and an independent source.
 
-    Variance and scale are computed without subtractions, which would lose precision, with :math:`s_0 =
-    \sqrt{v_0}` and the deviation :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 +
-    \beta c / s_0)^2 + (\beta q)^2`, and the scale of :math:`F` is :math:`|\alpha\dot\beta - \dot\alpha\beta|
-    \, s_0 q / \sqrt{Var(a_t)}`.
+    Variance and scale are computed without subtractions, which would lose precision, with the source's
+    standard deviation :math:`s_0`, the covariance :math:`c` of source and target, and the standard deviation
+    :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`,
+    and the scale of :math:`F` is :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
         network: the network :math:`F`, or its ``config()``.
-        moments: the moments of the prior's source and the targets; by default those of independent standard
-            normal ends, to be replaced by loading a state dict.
+        moments: the moments of the prior's source and the targets; by default those of an independent
+            standard normal source and target; loading a state dict replaces them.
         trend: the trend of the resting action, or its ``config()``. It gives :math:`E[a_0 | o]` and
             :math:`E[a_1 | o]` in place of the means above; the moments are then those of the remainder.
         interpolant: the path of the loss, or its ``config()``; linear by default.

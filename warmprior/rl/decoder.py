@@ -31,10 +31,10 @@ class PriorDecoder(TensorDictModuleBase):
     and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
     :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
-    Place it after the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy, whose parameters
-    require no gradients, and which stays in evaluation mode. Initialise an agent before you combine the two:
-    ``apply`` and ``reset_parameters_recursive`` of the sequence reach the policy too.
+    Place it after the agent, ``TensorDictSequential(agent, decoder)``, or use :class:`~warmprior.PriorSpace`,
+    which puts it before the environment. It runs a copy of the policy under ``no_grad``; the copy is frozen
+    and stays in evaluation mode. Initialise an agent before you combine the two: ``apply`` and
+    ``reset_parameters_recursive`` of the sequence reach the policy too.
 
     Args:
         actor: the policy, which is copied, or an object with the same interface, such as

@@ -106,7 +106,7 @@ def train_policy(
             them, as :meth:`Task.of` takes them; or a :class:`Task`.
         prior: the source distribution.
         directory: folder in which the training is saved, and from which it continues, see
-            :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training is lost.
+            :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training run is lost.
 
     Keyword Args:
         observation_keys: observations to read from a place, see :meth:`Task.open`.
@@ -133,7 +133,8 @@ def train_policy(
         TypeError: if the demonstrations or the prior have the wrong type.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
-        ValueError: if the demonstrations have the wrong form, or the folder holds a different training.
+        ValueError: if the demonstrations have the wrong form, or the folder belongs to a different training
+            run.
 
     Examples:
         >>> import torch
