@@ -1,4 +1,4 @@
-"""Errors by the facts that their sentence has to name, so that a better sentence breaks no test."""
+"""Check errors by the facts that their sentence names, so that a better sentence breaks no test."""
 
 import re
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ import pytest
 
 @contextmanager
 def raises(error, fact, *more):
-    """The block raises this error, and its text has each of these facts as whole words."""
+    """Check that the block raises this error, with each of these facts as whole words in its text."""
     with pytest.raises(error) as caught:
         yield caught
     text = str(caught.value)
@@ -17,7 +17,7 @@ def raises(error, fact, *more):
 
 
 def missing(text, *facts):
-    """The facts that a text lacks as whole words; a number is not found inside another one."""
+    """Return the facts that a text lacks as whole words; a number is not found inside another one."""
     return [fact for fact in facts if not re.search(_words(str(fact)), text)]
 
 

@@ -6,5 +6,5 @@ def copied(state):
 
 
 def same(one, two):
-    """The same names, and bit by bit the same tensors."""
+    """Return True if names are the same, and tensors bit by bit."""
     return one.keys() == two.keys() and all(torch.equal(two[name], value) for name, value in one.items())

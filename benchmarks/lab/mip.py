@@ -34,7 +34,7 @@ class MIPInterpolant(LinearInterpolant):
 
 
 class TwoStepCoupling:
-    r"""Independent pairs, at two times: :math:`t = 0`, at a source sample, and :math:`t = 0.9`.
+    r"""Pairs in order, at two times: :math:`t = 0`, at a source sample, and :math:`t = 0.9`.
 
     With :math:`f = a_t + (1 - t) v` the network predicts the action from both points. The policy is Euler's
     method from 0 to 0.9 to 1. If the network is preconditioned, both errors are divided by the standard

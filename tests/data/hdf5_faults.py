@@ -1,4 +1,4 @@
-"""What HDF5 allows in the place of a dataset, and no recording holds: each has to be refused."""
+"""Faults that HDF5 allows in the place of a dataset, and that no recording holds: each is refused."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""What a robot's drivers return reaches the policy as its training had it, or is refused by name."""
+"""Observations of drivers reach the policy in the form of its training, or are refused by name."""
 
 import numpy as np
 import pytest

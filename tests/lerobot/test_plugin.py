@@ -241,7 +241,7 @@ def flow_batch(length, size=3):
 
 
 def moments_for(policy, steps):
-    """Those that this library fits to steps of the policy's widths."""
+    """Return the moments that this library fits to steps of the policy's widths."""
     network = policy.actor.network
     sizes = network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
     return precondition(VelocityMLP(*sizes), steps, policy.actor.prior).moments.state_dict()

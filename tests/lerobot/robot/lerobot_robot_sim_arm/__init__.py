@@ -16,7 +16,7 @@ JOINTS = ("shoulder.pos", "elbow.pos")
 
 
 class Device:
-    """What both have in common."""
+    """Connect, and count connections, alike for arm and leader."""
 
     action_features = dict.fromkeys(JOINTS, float)
     is_calibrated, is_connected = True, False
