@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.errors import raises
-from tests.lerobot.test_plugin import VLA, flow_policy, small, warm
+from tests.lerobot.plugin_policies import VLA, flow_policy, small, warm
 
 NAMES = [*VLA, "warm_flow"]
 

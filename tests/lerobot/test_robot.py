@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from tests.errors import raises
+from tests.lerobot.plugin_policies import warm
 from tests.lerobot.test_actor import preprocessed
-from tests.lerobot.test_plugin import warm
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE, features
 from tests.toy_env import stirred
 from warmprior import PastPrior, RealTimeChunking

@@ -6,7 +6,7 @@ from lerobot.policies.rtc import ActionQueue, RTCConfig
 from lerobot.rollout.inference.rtc import _normalize_prev_actions_length, supports_rtc_inference
 
 from tests.errors import raises
-from tests.lerobot.test_plugin import VLA, warm
+from tests.lerobot.plugin_policies import VLA, warm
 from tests.lerobot.tiny import ACTION, LENGTH, observations
 
 

@@ -16,7 +16,7 @@ JOINTS = ("shoulder.pos", "elbow.pos")
 
 
 class Device:
-    """Connect, and count connections, alike for arm and leader."""
+    """A device without hardware, from which arm and leader inherit."""
 
     action_features = dict.fromkeys(JOINTS, float)
     is_calibrated, is_connected = True, False

@@ -1,0 +1,70 @@
+"""Small policies of the plugin, with their observations and batches."""
+
+from functools import partial
+
+import torch
+
+from tests.lerobot.tiny import (
+    make_groot,
+    make_pi,
+    make_smolvla,
+    tiny_gemma,
+    tiny_groot,
+    tiny_smolvlm,
+)
+
+VLA = ["warm_smolvla", "warm_pi05", "warm_groot"]
+
+
+def warm(found, name, **options):
+    kind = found[name]
+    config = kind.config_class
+    make = {"warm_smolvla": make_smolvla, "warm_groot": make_groot}.get(name, partial(make_pi, "pi05"))
+    return make(kind, config, **options)
+
+
+def small(name):
+    if name == "warm_groot":
+        return tiny_groot()
+    if name == "warm_smolvla":
+        from lerobot.policies.smolvla import smolvlm_with_expert
+
+        return tiny_smolvlm(smolvlm_with_expert)
+    from lerobot.policies.pi05 import modeling_pi05
+
+    return tiny_gemma(modeling_pi05)
+
+
+def flow_policy(found, images=None, **options):
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    inputs = {
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(3,)),
+        "observation.environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
+    }
+    if images is not None:
+        inputs["observation.images.top"] = PolicyFeature(type=FeatureType.VISUAL, shape=images)
+        options = {"encoder": "small", "image_size": 16, "crop_size": 12} | options
+    outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
+    chosen = {"embedding_dim": 24, "num_layers": 1, "nfe": 1, "n_action_steps": 4, "device": "cpu"}
+    kind, features = found["warm_flow"], {"input_features": inputs, "output_features": outputs}
+    torch.manual_seed(0)
+    return kind(kind.config_class(**features, **chosen | options))
+
+
+def one_observation():
+    return {"observation.state": torch.randn(2, 3), "observation.environment_state": torch.randn(2, 2)}
+
+
+def flow_batch(length, size=3):
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "observation.state": normal(size, 2, 3),
+        "observation.environment_state": normal(size, 2, 2),
+        "action": normal(size, length, 2),
+        "action_is_pad": torch.zeros(size, length, dtype=torch.bool),
+    }

@@ -1,0 +1,361 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.data.lerobot_parts import numbers, write_lerobot
+from tests.errors import raises
+from tests.lerobot.plugin_policies import flow_batch, flow_policy, one_observation
+from tests.toy_env import stirred
+from warmprior import (
+    HistoryObservation,
+    Normalizer,
+    PastPrior,
+    RealTimeChunking,
+    StartPoint,
+    VelocityMLP,
+    keys,
+)
+from warmprior.data import lerobot_steps
+from warmprior.history import cold_history
+from warmprior.training import precondition
+
+pytest.importorskip("lerobot_policy_warmprior")
+
+from lerobot.configs.types import NormalizationMode
+
+STATE, OBJECT = 9, 10  # of lift
+
+
+def moments_for(policy, steps):
+    """Return the moments that this library fits to steps of the policy's widths."""
+    network = policy.actor.network
+    sizes = network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
+    return precondition(VelocityMLP(*sizes), steps, policy.actor.prior).moments.state_dict()
+
+
+def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
+    """By the moments that this library fits to the same steps; and its averaged weights play."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
+    meta = LeRobotDatasetMetadata("local/tiny", root=tmp_path / "data")
+    config = flow_policy(found).config
+    widths = {name: feature["shape"] for name, feature in meta.features.items()}
+    for name, feature in config.input_features.items():
+        feature.shape = tuple(widths[name])
+    config.output_features["action"].shape = tuple(widths["action"])
+    policy = found["warm_flow"](config, dataset_meta=meta)
+    steps = lerobot_steps(tmp_path / "data", config.observed)
+    low, high = steps["action"].amin(0), steps["action"].amax(0)
+    normalised = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1
+    assert (normalised[:, -1] == -1).all()  # as LeRobot has what never changes
+    own = moments_for(policy, steps.set("action", normalised))
+    torch.testing.assert_close(policy.actor.network.moments.state_dict(), own)
+    before = [weight.clone() for weight in policy.averaged.module.parameters()]
+    policy.update()  # the first one copies
+    with torch.no_grad():
+        for weight in policy.actor.network.parameters():
+            weight.add_(1.0)
+    policy.update()
+    for old, new in zip(before, policy.averaged.module.parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.005)
+
+
+def dataset_policy(found, root, episodes=None, place=None, **options):
+    """As lerobot-train makes it, which names the dataset's metadata alone; and that dataset."""
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.policies.factory import make_policy
+
+    config = found["warm_flow"].config_class(embedding_dim=24, num_layers=1, device="cpu", **options)
+    config.pretrained_path = place
+    dataset = LeRobotDataset("local/tiny", root=root, episodes=episodes)
+    return make_policy(config, ds_meta=dataset.meta), dataset
+
+
+def moments_by_hand(policy, dataset, episodes):
+    """Of some episodes, normalised by the statistics of all, as LeRobot's processors do."""
+    steps = lerobot_steps(dataset.root, policy.config.observed)
+    steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
+    low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
+    steps["action"] = 2 * (steps["action"] - low) / (high - low) - 1
+    return moments_for(policy, steps)
+
+
+def test_it_is_preconditioned_for_the_episodes_of_the_training(found, tmp_path):
+    root = tmp_path / "data"
+    write_lerobot(root, (12, 12, 12), data_files_size_in_mb=0.001)
+    for episodes in ([0, 2], None):
+        policy, dataset = dataset_policy(found, root, episodes)
+        expected = moments_by_hand(policy, dataset, episodes or [0, 1, 2])
+        torch.testing.assert_close(policy.actor.network.moments.state_dict(), expected)
+    (root / "data/chunk-000/file-001.parquet").unlink()
+    dataset_policy(found, root, [0, 2])
+
+
+def test_a_training_that_goes_on_has_the_moments_of_its_own_data(found, tmp_path):
+    for name, seed in (("one", 0), ("two", 1)):
+        write_lerobot(tmp_path / name, (12, 12, 12), seed=seed)
+    first, _ = dataset_policy(found, tmp_path / "one")
+    first.update()
+    first.save_pretrained(tmp_path / "policy")
+    again, dataset = dataset_policy(found, tmp_path / "two", place=tmp_path / "policy")
+    expected = moments_by_hand(again, dataset, [0, 1, 2])
+    old = first.actor.network.moments.state_dict()
+    for network in (again.actor.network, again.averaged.module):
+        torch.testing.assert_close(network.moments.state_dict(), expected)
+    assert not torch.equal(expected["target_mean"], old["target_mean"])
+    weights = dict(first.actor.network.network.named_parameters())
+    assert all(torch.equal(v, weights[n]) for n, v in again.actor.network.network.named_parameters())
+    # Without a training it has its own; another source is for trainings alone.
+    saved = found["warm_flow"].from_pretrained(tmp_path / "policy")
+    assert torch.equal(saved.actor.network.moments.target_mean, old["target_mean"])
+    dataset_policy(found, tmp_path / "two", place=tmp_path / "policy", prior="past,sigma=0.1")
+
+
+def test_a_dataset_without_statistics_is_refused(found, tmp_path):
+    write_lerobot(tmp_path / "data", (12, 12))
+    (tmp_path / "data/meta/stats.json").unlink()
+    with raises(ValueError, "meta/stats.json", "action: min, action: max"):
+        dataset_policy(found, tmp_path / "data", precondition=False)
+
+
+def test_features_of_width_1(found, tmp_path):
+    """As LeRobotDataset and its loader give them, without that dimension."""
+    from lerobot.datasets import LeRobotDataset
+    from torch.utils.data import default_collate
+
+    write_lerobot(tmp_path / "data", (12, 12), {name: numbers(1) for name in ("observation.state", "action")})
+    policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4)
+    config = policy.config
+    deltas = {"action": config.action_delta_indices, "observation.state": config.observation_delta_indices}
+    times = {name: [i / 20 for i in steps] for name, steps in deltas.items()}
+    dataset = LeRobotDataset("local/tiny", root=tmp_path / "data", delta_timestamps=times)
+    batch = default_collate([dataset[i] for i in range(6)])
+    assert batch["action"].ndim == 2
+    loss, _ = policy.forward(batch)
+    loss.backward()
+    assert policy.eval().select_action({"observation.state": torch.zeros(3, 1)}).shape == (3, 1)
+
+
+def test_losses_of_samples(found):
+    policy = flow_policy(found).eval()
+    batch = flow_batch(8)
+    batch["action_is_pad"][1, 5:] = True
+    torch.manual_seed(5)
+    mean, _ = policy.forward(batch)
+    torch.manual_seed(5)
+    losses, said = policy.forward(batch, reduction="none")
+    count = torch.tensor([4.0, 1.0, 4.0])
+    assert losses.shape == (3,) and losses.grad_fn is not None
+    torch.testing.assert_close((losses * count).sum() / count.sum(), mean)
+    assert said["flow_matching"] == pytest.approx(losses.mean().item())
+    assert policy.forward(batch)[0].ndim == 0
+    with raises(ValueError, "reduction", "mean, none"):
+        policy.forward(batch, reduction="sum")
+
+
+@pytest.mark.parametrize("prior", ["past,sigma=0.0", "preview,sigma=0.0"])
+def test_fewer_actions_are_executed_than_remembered(found, prior, tmp_path):
+    flow_policy(found, prior=prior).save_pretrained(tmp_path)
+    config = found["warm_flow"].config_class.from_pretrained(tmp_path, cli_overrides=["--n_action_steps=3"])
+    policy = found["warm_flow"].from_pretrained(tmp_path, config=config).eval()
+    assert policy.actor.prior.chunk_length == 4
+    sources, chunks = [], []
+    policy.actor.register_forward_hook(lambda module, args, out: sources.append(out["prior", "loc"]))
+    policy.actor.register_forward_hook(lambda module, args, out: chunks.append(out["vla_action", "chunk"]))
+    batch = one_observation()
+    actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
+    assert len(sources) == 3
+    expected = actions[:, 2:6] if prior.startswith("past") else chunks[1][:, 3:7]
+    assert torch.equal(sources[2][:, :4], expected)
+    with raises(ValueError, "n_action_steps", 4, 5):
+        flow_policy(found, prior_chunk=4, n_action_steps=5)
+
+
+def test_the_flow_policys_loss_is_algorithm_1(found):
+    policy = flow_policy(found, prior="past,sigma=0.0", precondition=False).eval()
+    batch = flow_batch(8)
+    batch["action_is_pad"][0, :2] = True  # the beginning of an episode
+    batch["action_is_pad"][1, 6:] = True  # and an end
+    torch.manual_seed(5)
+    loss, _ = policy.forward(batch)
+    # By hand. The first draw is of the source, of which only the cold sample is left, then the times.
+    torch.manual_seed(5)
+    eps, t = torch.randn(3, 4, 2), torch.rand(3)
+    history, target = batch["action"].split(4, 1)
+    a0 = torch.where(torch.tensor([True, False, False])[:, None, None], eps, history)
+    a_t = a0 + t[:, None, None] * (target - a0)
+    seen = torch.cat([batch["observation.environment_state"], batch["observation.state"]], -1)
+    with torch.no_grad():
+        error = (policy.actor.network(t, a_t, seen) - (target - a0)).square()
+    inside = (~batch["action_is_pad"][:, 4:])[..., None].expand_as(error)
+    torch.testing.assert_close(loss.detach(), error[inside].mean())
+    with raises(KeyError, "action_is_pad"):
+        policy.forward({k: v for k, v in batch.items() if k != "action_is_pad"})
+
+
+def test_a_network_that_cannot_be_made_is_named(found):
+    missing = ["[", "3", '"x"', '{"name": "none"}', '{"name": "PlainMLP", "hidden_dim": -3}']
+    for network in (*missing, '{"name": "PreconditionedNetwork", "network": 5}'):
+        with raises(ValueError, "--policy.network"):
+            flow_policy(found, network=network)
+
+
+def test_the_flow_policy_remembers(found):
+    policy = flow_policy(found, prior="past,sigma=0.0").eval()
+    sources = []
+    policy.actor.register_forward_hook(lambda module, args, out: sources.append(out["prior", "noise"]))
+    batch = one_observation()
+    actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
+    assert len(sources) == 3
+    assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])
+    assert actions.abs().max() <= 1
+    policy.reset()
+    chunks = [policy.predict_action_chunk(dict(batch), executed_steps=4) for _ in range(2)]
+    with raises(ValueError, "executed_steps="):
+        policy.predict_action_chunk(dict(batch))
+    assert not torch.equal(sources[3], actions[:, 4:8])
+    assert torch.equal(sources[4], chunks[0])
+    with raises(ValueError, "executed_steps"):
+        policy.predict_action_chunk({name: value + 1 for name, value in batch.items()}, executed_steps=99)
+    assert torch.equal(policy._queues["observation.state"][-1], batch["observation.state"])  # not seen
+    policy.predict_action_chunk(dict(batch), executed_steps=2)  # of four
+    assert torch.equal(sources[5], torch.cat([chunks[0][:, 2:], chunks[1][:, :2]], 1))
+
+
+STANDARDISED = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}
+
+
+def test_the_flow_policy_sees_images(found, tmp_path):
+    """Resized, in a random window in training and the central one else; saved and loaded with its encoder."""
+    policy = flow_policy(found, images=(3, 16, 16), precondition=False)
+    batch = flow_batch(8)
+    pictures = torch.randint(256, (3, 2, 3, 16, 16), generator=torch.Generator().manual_seed(1))
+    batch["observation.images.top"] = pictures / 255
+    policy.train().forward(batch)[0].backward()
+    assert all(weight.grad is not None for weight in policy.actor.network.encoder.parameters())
+    torch.manual_seed(3)
+    loss = policy.eval().forward(batch)[0]
+    vector = torch.cat([batch["observation.environment_state"], batch["observation.state"]], -1)
+    observation = TensorDict({"state": vector, "observation.images.top": pictures.to(torch.uint8)}, [3])
+    features = policy.actor.network.encoder(observation)
+    torch.manual_seed(3)
+    a0, t = torch.randn(3, 4, 2), torch.rand(3)
+    history, target = batch["action"].split(4, 1)
+    a0 = history + 0.5 * a0
+    error = policy.actor.network.network(t, a0 + t[:, None, None] * (target - a0), features) - (target - a0)
+    torch.testing.assert_close(loss, error.square().mean())
+
+    policy.save_pretrained(tmp_path / "saved")
+    again = found["warm_flow"].from_pretrained(tmp_path / "saved").eval()
+    flat = torch.full((2, 3, 20, 24), 0.4)  # any size and shape is resized
+    start = {"observation.state": torch.zeros(2, 3), "observation.environment_state": torch.zeros(2, 2)}
+    actions = []
+    for one in (policy, again):
+        one.reset()
+        torch.manual_seed(7)
+        actions.append(one.select_action({**start, "observation.images.top": flat}))
+    assert actions[0].shape == (2, 2) and torch.equal(*actions)
+    with raises(KeyError, "images.top"):
+        policy.select_action(start)
+    for options, fact in (({"encoder": "tiny"}, "resnet18-imagenet"), (STANDARDISED, "MEAN_STD")):
+        with raises(ValueError, fact):
+            flow_policy(found, images=(3, 16, 16), **options)
+    with raises(ValueError, "[3, h, w]", "observation.images.top", "[1, 16"):
+        flow_policy(found, images=(1, 16, 16))
+
+
+class Halfway(StartPoint):
+    """Half of the source's noise, at half of the time."""
+
+    name = "halfway-in-lerobot"
+    time, noise_share = 0.5, 0.5
+
+    def forward(self, noise, history, observation):
+        return self.noise_share * noise
+
+
+def saved_policy(folder, **options):
+    """A policy of lift's widths, with the environment that it was made for."""
+    from warmprior import VelocityMLP, WarmPriorActor
+    from warmprior.envs.description import environment_description
+    from warmprior.envs.simulator import task_env_args
+    from warmprior.training import save_policy
+
+    torch.manual_seed(0)
+    data = torch.rand(2, 50, OBJECT + STATE), torch.rand(2, 50, 7)
+    (low, high), (least, most) = ((value.amin(1), value.amax(1)) for value in data)
+    low[0, 3] = high[0, 3] = 0.5  # constant
+    ends = ((low, least), (high, most))
+    normalizer = Normalizer(*({"observation": seen[0], "action": action[0]} for seen, action in ends))
+    seen = options.get("observation_key") == keys.CONDITIONED
+    width = HistoryObservation.width(8, 7) if seen else 0
+    network = stirred(VelocityMLP(7, OBJECT + STATE + width, 8), by=0.05)
+    environment = environment_description(task_env_args("lift"), "ph", 2, "delta", None)
+    chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
+    actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
+    save_policy(actor, folder)
+    return actor
+
+
+def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
+    pytest.importorskip("robosuite")
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot_policy_warmprior.export import export_policy, main
+
+    actor = saved_policy(tmp_path / "ours")
+    out = export_policy(tmp_path / "ours", tmp_path / "theirs")
+    policy = found["warm_flow"].from_pretrained(out)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(out))
+    assert policy.actor.prior.config() == actor.prior.config()
+    raw = torch.randn(OBJECT + STATE)
+    seen = {"observation.environment_state": raw[:OBJECT], "observation.state": raw[OBJECT:]}
+    torch.manual_seed(7)
+    action = after(policy.select_action(before(dict(seen))))
+    # The same by this library: normalised, the observation twice, cold, and back.
+    data = actor.normalizer.normalize(TensorDict({"observation": raw.expand(1, 2, -1)}, [1]))
+    data.set("history", cold_history([1], 8, 8, 7))
+    torch.manual_seed(7)
+    chunk = actor(data)["vla_action", "chunk"]
+    expected = actor.normalizer.denormalize(TensorDict({"action": chunk[:, 0]}, [1]))["action"]
+    torch.testing.assert_close(action, expected)
+    with raises(FileExistsError, "folder"):
+        export_policy(tmp_path / "ours", out)
+    assert main([str(tmp_path / "ours"), str(tmp_path / "again")]) == 0
+    for i, (options, fact) in enumerate(
+        [
+            *(({"clip": None}, "clip=1.0"), ({"observation_key": keys.CONDITIONED}, "last actions")),
+            *(({"solver": "midpoint", "nfe": 4}, "Euler"), ({"grid": "dense-jump"}, "uniform")),
+            *(({"guidance": RealTimeChunking()}, "guidance"), ({"start": Halfway()}, "Euler")),
+        ]
+    ):
+        saved_policy(tmp_path / f"other{i}", **options)
+        with raises(ValueError, fact):
+            export_policy(tmp_path / f"other{i}", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_environment_has_the_observations_of_converted_demonstrations():
+    pytest.importorskip("robosuite")
+    import numpy as np
+    from gymnasium.utils.env_checker import check_env
+    from lerobot_policy_warmprior import RobosuiteEnvConfig
+
+    from warmprior.envs import RobosuiteEnv
+
+    config = RobosuiteEnvConfig(task="lift", episode_length=5)
+    ((batch,),) = (suite.values() for suite in config.create_envs(2).values())
+    single = batch.envs[0]
+    check_env(single, skip_render_check=True)
+    observation, _ = batch.reset(seed=[3, 4])
+    ours = RobosuiteEnv("lift", seed=3).reset()["observation"]
+    assert np.array_equal(observation["environment_state"][0], ours[:OBJECT])
+    assert np.array_equal(observation["agent_pos"][0], ours[OBJECT:])
+    for _ in range(5):
+        *_, truncated, info = batch.step(np.zeros((2, 7), np.float32))
+    assert truncated.all() and info["final_info"]["is_success"].tolist() == [False, False]
+    features = {name: entry.shape for name, entry in config.features.items()}
+    assert features == {"action": (7,), "agent_pos": (STATE,), "environment_state": (OBJECT,)}
+    batch.close()
+    with raises(ValueError, "task", "'life'"):
+        RobosuiteEnvConfig(task="life")
