@@ -19,6 +19,7 @@ from tests.errors import raises
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import DatasetError, RobomimicDemonstrations
+from warmprior.data.images import check_images
 from warmprior.data.opening import Demonstrations
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
@@ -216,10 +217,9 @@ def test_images_of_another_kind_are_refused(picture, value, facts):
 @pytest.mark.slow
 def test_images_upside_down_are_refused(picture):
     key = f"data/demo_0/obs/{IMAGES[0]}"
-    found = Demonstrations(picture)
-    compare = partial(found.with_images, CAMERAS, 16, demos=None)
+    compare = partial(apart(check_images), Demonstrations(picture), CAMERAS)
     compare(fast=True)
-    with raises(DatasetError, "--fast-rendering"):
+    with raises(DatasetError, "fast_rendering=True"):
         compare(fast=False)
     changes = {
         "upside down": lambda images: images[:, ::-1],
@@ -232,6 +232,18 @@ def test_images_upside_down_are_refused(picture):
         replaced(picture, lambda images, change=change: change(before), key)
         with raises(DatasetError, "agentview", fact):
             compare(fast=True)
+
+
+@pytest.mark.parametrize("missing", ["renderer", "states"])
+def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkeypatch, missing):
+    replaced(picture, lambda images: images[:, ::-1], f"data/demo_0/obs/{IMAGES[0]}")
+    if missing == "renderer":  # as on many servers with GPUs
+        monkeypatch.setattr("warmprior.data.images.rendering_backend", lambda: None)
+    else:
+        replaced(picture, None, "data/demo_0/states")
+    with pytest.warns(UserWarning, match=picture.name) as warned:
+        check_images(Demonstrations(picture), CAMERAS, fast=True)
+    assert any(word in str(warned[0].message) for word in (missing, "renders"))
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
