@@ -22,7 +22,8 @@ def played_table(name: str) -> str:
     """Return success of a run in Markdown: percent, and episodes won and lost against the Gaussian source.
 
     There is a line per NFE and factor of the source's noise, and per NFE a line in which every source has its
-    own best factor, chosen on other episodes. Seeds are pooled.
+    own best factor, chosen on other episodes, if the same episodes were played with every factor. Seeds are
+    pooled.
     """
     rows = read_played(name)
     names = [source for source in SOURCES if source in set(rows["source"])]
@@ -40,8 +41,10 @@ def played_table(name: str) -> str:
         ]
         if len(noises) > 1:
             every = {s: [solved[n, s] for n in noises if (n, s) in solved] for s in names}
-            best = {s: chosen_elsewhere(np.stack(e)) for s, e in every.items() if len(e) == len(noises)}
-            text.append(_played_line(nfe, "own best", best, names))
+            full = {s: e for s, e in every.items() if len(e) == len(noises) and len({*map(len, e)}) == 1}
+            if full:
+                best = {s: chosen_elsewhere(np.stack(outcomes)) for s, outcomes in full.items()}
+                text.append(_played_line(nfe, "own best", best, names))
     return "\n".join(text) + "\n"
 
 
