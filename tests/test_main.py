@@ -73,6 +73,14 @@ def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     assert far > abs(frames[0].astype(int) - frames[1]).mean()
 
 
+def test_a_video_is_refused_before_the_episodes_where_nothing_renders(saved, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("warmprior.envs.rendering.rendering_backend", lambda: None)
+    argv = ["evaluate", str(saved[0]), "--episodes", "1", "--video", str(tmp_path / "out.mp4")]
+    assert main(argv) == 2
+    said = capsys.readouterr()
+    assert not missing(said.err, "EGL", "OSMesa", "libosmesa6") and "solved" not in said.out
+
+
 def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, monkeypatch):
     pytest.importorskip("huggingface_hub")
     folder, episode = saved

@@ -164,7 +164,7 @@ class DataOptions:
         if self.obs == "image":
             try:
                 require_rendering()
-            except RuntimeError as error:
+            except OSError as error:
                 raise ValueError(f"--obs image needs the simulator's images: {error}") from error
             if self.actions == "absolute":
                 raise ValueError("--obs image goes with --actions delta, as in the paper")

@@ -37,7 +37,8 @@ class CameraImages(EnvTransform):
     Raises:
         ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
         KeyError: if the environment does not write its state.
-        RuntimeError: if the environment is not a simulator, or this machine cannot render.
+        RuntimeError: if the environment is not a simulator.
+        OSError: if this machine cannot render.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
