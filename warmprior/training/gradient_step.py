@@ -53,6 +53,7 @@ class GradientStep:
         if isinstance(actor.prior, nn.Module):
             self.trained["prior"] = actor.prior
         self.ema = ema_of(self.trained, config.ema_rate)
+        self._average = cast(Any, self.ema).update_from(self.trained)
         shared: dict[str, Any] = {"objective": config.objective, "weighting": config.weighting}
         shared |= {"coupling": coupling, "generator": generator}
         self.loss_module = FlowMatchingLoss(actor, times=config.times, **shared)
@@ -103,7 +104,7 @@ class GradientStep:
             nn.utils.clip_grad_norm_(self.trained.parameters(), self._max_grad_norm)
         self.optimizer.step()
         self.schedule.step()
-        self.ema.update_parameters(self.trained)
+        self._average()
         return loss.detach()
 
     def averaged(self, actor: WarmPriorActor) -> WarmPriorActor:

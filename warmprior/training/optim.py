@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
@@ -88,14 +89,30 @@ def _move(averaged: list[Tensor], current: list[Tensor], _: Tensor, *, rate: flo
 class _Average(AveragedModel):
     """An average that keeps its count on the CPU: PyTorch's waits for the device at every update."""
 
-    @torch.no_grad()
     def update_parameters(self, model: nn.Module) -> None:
+        self.update_from(model)()
+
+    def update_from(self, model: nn.Module) -> Callable[[], None]:
+        """Return a function that updates the average from a model that keeps its parameters and buffers.
+
+        It collects them once, which for a large network takes milliseconds.
+        """
         averages: list[Tensor] = list(self.module.parameters())
         weights: list[Tensor] = list(model.parameters())
+        return partial(self._update, averages, weights, list(self.module.buffers()), list(model.buffers()))
+
+    @torch.no_grad()
+    def _update(
+        self,
+        averages: list[Tensor],
+        weights: list[Tensor],
+        averaged_buffers: list[Tensor],
+        buffers: list[Tensor],
+    ) -> None:
         if self.n_averaged.item():
             cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
             torch._foreach_copy_(averages, weights)
-        for averaged, buffer in zip(self.module.buffers(), model.buffers(), strict=True):
+        for averaged, buffer in zip(averaged_buffers, buffers, strict=True):
             averaged.copy_(buffer)
         self.n_averaged += 1
