@@ -162,7 +162,7 @@ class Train:
 
     network: NetworkOptions
     training: TrainingConfig
-    prior: str = "past"
+    prior: str = "past,correlation=0.5"
     chunk: int = 8
     nfe: int = DEFAULT_NFE
     observation_keys: tuple[str, ...] | None = None

@@ -64,7 +64,7 @@ class AsyncExecutor:
             that reads ``"observation"`` (or ``("prior", "observation")``, which includes the last actions),
             ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``. It is set to evaluation
             mode, and called without batch dimensions.
-        prior: the policy's prior, of which only the lengths matter; the actor's own by default.
+        prior: the policy's prior (only its lengths are used); the actor's own by default.
         execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.

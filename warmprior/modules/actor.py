@@ -153,11 +153,11 @@ def check_usual_keys(policy: Any, whose: str) -> None:
 class WarmPriorActor(TensorDictModuleBase):
     """A flow-matching policy with any source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
-    It composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history
-    that it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it
+    It composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. It reads
+    the history that :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow` writes, so it
     works unchanged in ``env.rollout``, collectors, batched environments and replay buffers. The flow starts
-    at the source's mean under ``ExplorationType.DETERMINISTIC``, and otherwise at a random draw; pass a
-    seeded generator to make it reproducible.
+    at a random draw of the source; pass a seeded generator to make it reproducible. Under every
+    ``ExplorationType`` but ``RANDOM`` it starts at the mean, unless the policy has a ``temperature``.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
@@ -167,7 +167,7 @@ class WarmPriorActor(TensorDictModuleBase):
         normalizer: the normaliser of the data. Its :meth:`~warmprior.Normalizer.env_transforms` belong
             directly after the base environment.
         environment: JSON description of the environment that the policy was made for, saved with the policy
-            (``python -m warmprior evaluate FOLDER``).
+            for ``python -m warmprior evaluate FOLDER``.
         generator: random generator of the sampler, which can also be passed per call: ``actor(data,
             generator=...)``.
         observation_key: key of the observation, ``[*B, To, d_o]``, or of a group of observations nested under
@@ -275,7 +275,7 @@ class WarmPriorActor(TensorDictModuleBase):
 
     @property
     def observation_key(self) -> NestedKey:
-        """The key of what the network sees."""
+        """The key of the network's observation."""
         return self.ode.observation_key
 
     @property

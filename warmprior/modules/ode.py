@@ -187,8 +187,8 @@ class Sampling:
             for each. Set it to the range of the normalised data, such as 1, so that the environment executes
             exactly the actions that the prior remembers.
         temperature: factor on the source's noise at decisions, ``a_0 = mu + temperature * sigma * eps``. By
-            default 1, and 0 under ``ExplorationType.DETERMINISTIC``, ``MEAN`` or ``MODE``: the flow then
-            starts at the source's mean.
+            default 1, and 0 under ``ExplorationType.DETERMINISTIC``, ``MEAN``, ``MEDIAN`` or ``MODE``: the
+            flow then starts at the source's mean.
 
     Raises:
         ValueError: if an option is unknown, out of range, or not supported by the network's training.

@@ -236,8 +236,8 @@ class PreviewPrior(Prior):
 
     The network predicts ``P = 2H`` actions. In training the forecast is the target's own first ``H`` actions
     (Eq. 3); at decisions it is positions ``[k, k+H)`` of the previous prediction (Eq. 4). The second half is
-    always cold. Every episode starts with a cold first half, which Algorithm 1 never shows the network;
-    :class:`~warmprior.WithheldHistory` does, which matters for small ``sigma``.
+    always cold. At an episode's start the first half is cold too. Algorithm 1 never trains this;
+    :class:`~warmprior.WithheldHistory` does, and it matters for small ``sigma``.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.

@@ -54,8 +54,8 @@ class FlowMatchingLoss(LossModule):
             and data with standard deviation :math:`s`, errors at ``t = 0``, the time of one-step samplers,
             have :math:`s^2` times the weight of those at ``t = 1``.
         interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or linear.
-        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number, or by the sum
-            of their weights), ``"sum"`` (Algorithm 1) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
+        reduction: ``"sum"`` (Algorithm 1), ``"mean"`` (that sum over the number of unpadded coordinates, or
+            their total weight) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: draws ``t`` and :math:`a_0`; by default that of the actor's sampler.
 
     .. note::

@@ -47,11 +47,11 @@ STATE_FORMAT = 7
 
 
 class BehaviourCloning:
-    """A training of a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
+    """A run that trains a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
 
     The folder receives ``state.safetensors`` (all that is needed to continue) and a policy with averaged
-    weights per checkpoint, ``policy_000250/`` and so on. The same training on a folder with a state continues
-    it; on a CPU the result is bitwise that of an uninterrupted run with the same number of threads.
+    weights per checkpoint, ``policy_000250/`` and so on. Starting it again on the same folder
+    continues it; on a CPU the result is bitwise equal to that of an uninterrupted run with as many threads.
 
     Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and runs the
     same training and draws its own part of every batch, PyTorch's DDP averages the gradients, and only the
@@ -68,7 +68,7 @@ class BehaviourCloning:
         observation_steps: ``To``.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
-        compile: True compiles the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
+        compile: True compiles the velocity network with :func:`torch.compile`; on a GPU, with CUDA graphs.
         prefetch: True gathers batches ahead in a thread, drawn by a separate generator. This is always done
             if the data are on the CPU and the network is not.
 
@@ -181,8 +181,8 @@ class BehaviourCloning:
         Without a ``description`` there is no progress bar.
 
         Raises:
-            FloatingPointError: if the loss becomes NaN or infinite; the last state and all policies stay.
-            BlockingIOError: if another process trains in the folder.
+            FloatingPointError: if the loss becomes NaN or infinite; the last state and all policies are kept.
+            BlockingIOError: if another process is training in the folder.
         """
         if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
             return

@@ -85,7 +85,7 @@ class GradientStep:
         self._max_grad_norm, self._count_padding = config.max_grad_norm, config.count_padding
 
     def compile(self) -> None:
-        """Compile the network; on a GPU, as CUDA graphs."""
+        """Compile the network; on a GPU, with CUDA graphs."""
         count_devices()
         self._graphs = self._device.type == "cuda"
         self.loss_module.actor_network.network.compile(mode="reduce-overhead" if self._graphs else None)

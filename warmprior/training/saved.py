@@ -174,8 +174,8 @@ def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Ten
 def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
     """Save a policy as ``model.safetensors``, with a readable copy of its configuration, ``config.json``.
 
-    Network, prior and normaliser each keep their precision. :func:`load_policy` detects any change by a
-    digest. An interrupted save over a policy leaves either the old policy or the new one.
+    Network, prior and normaliser each keep their precision. A digest lets :func:`load_policy` detect any
+    change. An interrupted save over a policy leaves either the old policy or the new one.
 
     Args:
         actor: the policy.
@@ -183,7 +183,8 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
 
     Raises:
         OSError: if the folder cannot be written to.
-        TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
+        TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed), or JSON
+            cannot hold a part's options.
         ValueError: if the policy could not be loaded again, which is checked before writing.
 
     Examples:
@@ -268,14 +269,14 @@ def load_policy(
     revision: str | None = None,
     token: str | None = None,
 ) -> WarmPriorActor:
-    """Load a policy that :func:`save_policy` or :func:`push_policy` wrote; its chunks are bit-identical.
+    """Load a policy that :func:`save_policy` or :func:`push_policy` wrote.
 
-    No code in the file is run: weights are tensors, and the configuration names classes that must already be
-    imported.
+    Its chunks are bit-identical to the original's. No code in the file is run: weights are tensors, and the
+    configuration names classes that must already be imported.
 
     Args:
         directory: the folder with ``model.safetensors``; or, if there is no such folder, a repository on the
-            Hugging Face hub, as text ``"user/name"``.
+            Hugging Face hub, ``"user/name"``.
 
     Keyword Args:
         device: device of the weights.

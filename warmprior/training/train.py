@@ -101,7 +101,7 @@ def train_policy(
     so that results are reproducible.
 
     Args:
-        demonstrations: a place that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
+        demonstrations: a file or dataset that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
             ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
             them, as :meth:`Task.of` takes them; or a :class:`Task`.
         prior: the source distribution.
@@ -109,8 +109,8 @@ def train_policy(
             :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training run is lost.
 
     Keyword Args:
-        observation_keys: observations to read from a place, see :meth:`Task.open`.
-        image_keys: images to read from a place, see :meth:`Task.open`.
+        observation_keys: observations to read from it, see :meth:`Task.open`.
+        image_keys: images to read from it, see :meth:`Task.open`.
         nfe: network evaluations per chunk, saved with the policy; 3 by default.
         network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.

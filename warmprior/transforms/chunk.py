@@ -165,7 +165,7 @@ def _roots(names: Iterable[NestedKey]) -> set[str]:
 
 
 class ChunkStep(EnvTransform):
-    r"""A transform that lets an environment of single actions take action chunks (a semi-MDP).
+    r"""A transform that lets a single-action environment take action chunks (a semi-MDP).
 
     One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, and stops each
     sub-environment at the end of its own episode. The reward is the discounted sum :math:`\sum_{i<k} \gamma^i
@@ -176,20 +176,20 @@ class ChunkStep(EnvTransform):
 
     Append it after per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
     ``VideoRecorder``) and before per-decision ones (:class:`ActionHistory`, ``InitTracker``). If all per-step
-    transforms are without memory (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they
+    transforms are memoryless (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they
     run only at the steps that a chunk's last observation depends on. In a partial step, rows that are not
     stepped keep all observations.
 
     An environment without batch dimensions may take all steps of a chunk in one call, as
     :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It needs a method
     ``control_steps(actions, keep)``, defined in the class that defines ``_step``: it executes raw actions
-    ``[n, d_a]`` until the episode ends, and returns a tensordict per step, the last ``keep`` of them as
-    ``_step`` returns them, the earlier ones with only reward, flags and ``"success"``.
+    ``[n, d_a]`` until the episode ends and returns one tensordict per step, complete for the last ``keep``,
+    and before that with reward, flags and ``"success"`` only.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
         ``VecNormV2``, update it in all rows, including those that a partial step leaves out. If rows stay out
-        for longer than until their reset, place such transforms inside the workers.
+        beyond their reset, place such transforms inside the workers.
         :class:`ObservationStack` has no such memory.
 
     Args:
@@ -200,8 +200,8 @@ class ChunkStep(EnvTransform):
         gamma: discount per control step.
         success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
             ignored if the environment does not write it.
-        measures: further keys, each with ``"max"``, ``"sum"`` or ``"last"``, which reduces the values after
-            the executed steps to the value after a chunk.
+        measures: further keys, each with ``"max"``, ``"sum"`` or ``"last"``: how its values over the executed
+            steps become one per chunk.
         action_keys: keys of the environment's actions, vectors ``[*B, d_a]``, or ``[*B, n, d_a]`` for the
             ``n`` agents of a group.
         chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]`` or ``[*B, n, P, d_a]``. Policies or
@@ -210,7 +210,7 @@ class ChunkStep(EnvTransform):
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
             or there are not as many chunk keys as action keys.
-        KeyError: (in an environment) if there is no such action, or an action without a chunk key.
+        KeyError: (in an environment) unless ``action_keys`` name exactly its actions.
         RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
             episode.
@@ -314,7 +314,7 @@ class ChunkStep(EnvTransform):
         return self._inner[1:]
 
     def _check_shapes(self, base: EnvBase, parent: EnvBase) -> None:
-        """Raise ValueError unless every row has one end flag and observations of the same shapes."""
+        """Raise RuntimeError unless every row has one end flag and observations of the same shapes."""
         done, batch = parent.full_done_spec["done"].shape, parent.batch_size
         if tuple(done) != (*batch, 1):
             raise RuntimeError(

@@ -19,7 +19,7 @@ from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_
 
 
 class ActionHistory(EnvTransform):
-    """A transform that writes the history for the next decision after each step, and a cold one at resets.
+    """A transform that writes the next decision's history after each step, and a cold history at resets.
 
     It has no state, so it works in ``env.rollout``, collectors and batched environments, inside and outside
     workers, and when only some sub-environments reset. :mod:`warmprior.history` describes the layout.
@@ -57,7 +57,7 @@ class ActionHistory(EnvTransform):
         self._chunk: TensorSpec | None = None
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Set the container, and forget the action spec of the environment before."""
+        """Set the container, and forget the previous environment's action spec."""
         super().set_container(container)
         self._chunk = None
 

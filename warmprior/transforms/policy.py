@@ -44,15 +44,14 @@ def policy_transforms(
     inside only).
 
     Args:
-        policy: the policy, or its prior, of which only the lengths matter.
+        policy: the policy, or its prior (only its lengths are used).
         normalizer: the normaliser of the training data; the policy's by default. Pass the policy's prior
             instead of the policy if the environment is already normalised.
         actions: transform that converts the policy's actions, in raw units, to the environment's, such as
             :class:`AbsoluteActions`; it is copied.
         images: transform that adds images to observations, such as :class:`CameraImages`; it is copied.
         observation_steps: ``To``; by default that of the policy's network, or 2.
-        execute: actions executed per decision; by default ``H``, or, with a ``delay``, as many as the
-            prediction allows.
+        execute: actions executed per decision; ``H`` by default; with a ``delay``, at most ``P - delay``.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 if the
             policy has :class:`~warmprior.RealTimeChunking`; otherwise no delay is written.
         gamma: discount per control step inside a chunk.

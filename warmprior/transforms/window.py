@@ -18,13 +18,13 @@ from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
 
 class ActionWindow(Transform):
-    """A transform that replaces sampled steps by training windows with the history before them.
+    """A transform that replaces sampled steps with training windows and their history.
 
     For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations (the
     episode's first one repeated at the start), the target chunk ``[i, i+P)`` (the episode's last action
     repeated past its end, and marked in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the
     actions before step ``i``, and the target's first ``P - H`` actions as a forecast. Windows never cross
-    episode borders. One buffer serves all priors with the same lengths.
+    episode borders. One transform serves all priors with the same lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
@@ -32,15 +32,16 @@ class ActionWindow(Transform):
             An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
         chunk_length: ``H``.
         prediction_length: ``P``; ``H`` by default.
-        history_length: number of executed actions that are remembered, at least ``H``, the default.
+        history_length: number of executed actions that are remembered, at least ``H``; ``H`` by default.
         observation_steps: ``To``.
         observation_key: key of the observation, in ``data`` and in windows.
 
     Raises:
         KeyError: if ``data`` lacks a key.
-        ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
-            not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
-        IndexError: (on a call) if the data do not hold a step.
+        ValueError: if not ``1 <= chunk_length <= min(prediction_length, history_length)``, or if ``data`` is
+            empty or not flat, an action is not one vector, an entry holds NaN or Inf, or an
+            episode is not contiguous.
+        IndexError: (on a call) if a step number is outside the data.
 
     Examples:
         >>> import torch
@@ -192,7 +193,7 @@ def window_transforms(
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the policy's prior, of which only the lengths matter.
+        prior: the policy's prior (only its lengths are used).
         observation_steps: ``To``.
         see_history: True if the network sees the last actions.
         withhold: share of the windows whose history is withheld.
@@ -245,7 +246,7 @@ def window_replay_buffer(
 
     Args:
         data: contiguous normalised steps ``[N]``, see :class:`ActionWindow`.
-        prior: the policy's prior, of which only the lengths matter.
+        prior: the policy's prior (only its lengths are used).
         batch_size: windows per sample.
         observation_steps: ``To``.
         see_history: True if the network sees the last actions.
