@@ -49,9 +49,14 @@ def text_of(row: Mapping[str, Any], name: str) -> str:
 
 
 def setting_title(row: Mapping[str, Any]) -> str:
-    """Return task and style, with actions and observations if they are unusual."""
+    """Return task and style, with actions and observations if they are unusual.
+
+    >>> setting_title({"task": "square", "data": "mh"}), setting_title({"task": "pusht", "data": "human"})
+    ('Square-MH', 'Pusht-Human')
+    """
     spaces = ((text_of(row, "actions"), "actions"), (text_of(row, "obs"), "observations"))
-    title = f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
+    style = row["data"].upper() if row["data"] in ("ph", "mh") else row["data"].title()
+    title = f"{row['task'].replace('_', '-').title()}-{style}"
     return ", ".join([title, *(f"{space} {words}" for space, words in spaces if space)])
 
 
