@@ -25,11 +25,13 @@ from shared import (
     PREVIEW,
     SOURCES,
     WIDTH,
+    beside,
     figure,
     finish,
     read,
     read_played,
     save,
+    shown_sources,
 )
 
 from lab.statistics import resampled_means
@@ -99,12 +101,12 @@ def draw() -> None:
     """Draw the mean over families against the number of network evaluations."""
     frame = standings()
     picture, (axis,) = figure(WIDTH, 4.6, 1, "Human demonstrations: the mean of four sets")
-    for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
+    for k, source in enumerate(shown := shown_sources(frame)):
+        label, color, mark = SOURCES[source]
         part = frame[frame["source"] == source].sort_values("nfe")
-        if len(part):
-            bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
-            places = part["nfe"] * (1 + 0.03 * (k - 1.5))
-            axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
+        bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
+        places = part["nfe"] * beside(k, len(shown))
+        axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
     finish(axis, "", xlabel="network evaluations per chunk (NFE)", ylabel="solved in percent, 95% interval")
     axis.set(xscale="log", ylim=(0, None))
     axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from shared import GAUSSIAN, SOURCES, read_played
+from shared import GAUSSIAN, SOURCES, read_played, shown_sources
 
 from lab.statistics import chosen_elsewhere
 
@@ -26,7 +26,7 @@ def played_table(name: str) -> str:
     pooled.
     """
     rows = read_played(name)
-    names = [source for source in SOURCES if source in set(rows["source"])]
+    names = shown_sources(rows)
     text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
     text.append("|---" * (2 + len(names)) + "|")
     for nfe, part in rows.sort_values(["nfe", "noise"], ascending=False).groupby("nfe", sort=False):

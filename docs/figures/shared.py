@@ -88,17 +88,27 @@ def finish(axis: Axes, title: str, **settings: object) -> None:
     axis.grid(axis="y", color="0.9")
 
 
+def shown_sources(rows: DataFrame) -> list[str]:
+    """Return the sources of some rows, in the order of :data:`SOURCES`."""
+    return [source for source in SOURCES if source in set(rows["source"])]
+
+
+def beside(k: int, count: int) -> float:
+    """Return the factor on a logarithmic axis that sets the `k`-th of some marks beside the others."""
+    return 1 + 0.03 * (k - (count - 1) / 2)
+
+
 def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool = True) -> None:
     """Draw success against a column, a line per source."""
-    for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
+    for k, source in enumerate(shown := shown_sources(rows)):
+        label, color, mark = SOURCES[source]
         part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
-        if len(part):
-            ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
-            bars = np.abs(ends - part["success"].to_numpy()) if interval else None
-            places = part.index.to_numpy(dtype=float) * (1 + 0.025 * (k - 2))
-            axis.errorbar(
-                places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
-            )
+        ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
+        bars = np.abs(ends - part["success"].to_numpy()) if interval else None
+        places = part.index.to_numpy(dtype=float) * beside(k, len(shown))
+        axis.errorbar(
+            places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
+        )
     axis.set(xscale="log", ylim=(-3, 103))
     axis.set_xticks(ticks, [f"{n:,}" for n in ticks])
     axis.minorticks_off()
