@@ -133,10 +133,3 @@ def test_peak_memory(tmp_path, options):
     ratio, size = map(float, result.stdout.split())
     assert size > 5e7
     assert 0.7 < ratio < 1.3  # below, the measurement itself would be broken
-
-
-def test_absolute_actions_of_long_demos_are_made_in_blocks(square_file, monkeypatch):
-    path, _ = square_file
-    whole = RobomimicDemonstrations(path, absolute_actions=True).data
-    monkeypatch.setattr("warmprior.data.replay.BLOCK", 7)
-    assert (RobomimicDemonstrations(path, absolute_actions=True).data == whole).all()

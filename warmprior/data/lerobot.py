@@ -15,7 +15,13 @@ from torch import Tensor
 
 from warmprior.checks import check_shape
 from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_file, read_lerobot_index
-from warmprior.data.replay import DatasetError, DemonstrationReader, DemonstrationReplay, store_finite
+from warmprior.data.replay import (
+    DatasetError,
+    DatasetIndex,
+    DemonstrationReader,
+    DemonstrationReplay,
+    store_finite,
+)
 from warmprior.io.extras import require
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
@@ -49,14 +55,14 @@ class LeRobotReader(DemonstrationReader):
         features = index.metadata.features
         self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
 
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of an array; without ``next.reward``, rewards are ``next.success``, or else zeros."""
+    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
+        """Read the first rows of an array; rewards are ``next.reward``, ``next.success``, or else zeros."""
         feature, part = self._place(key)
         if feature is None:
             out[...] = 0
             return
-        block = self._rows(self._episodes[demo], feature)[first : first + len(out), part]
-        store_finite(block, out, self.name(demo, key), first, _REBUILD)
+        block = self._rows(self._episodes[demo], feature)[: len(out), part]
+        store_finite(block, out, self.name(demo, key), _REBUILD)
 
     def _rows(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
         """Return all rows of an episode, ``[rows, width]``."""
@@ -152,14 +158,12 @@ class LeRobotDemonstrations(DemonstrationReplay):
             did not write; a converted one must name the same environment. Frequency, widths and names are
             checked against it, and robomimic's observations are found with it. Without it, whole features
             are observations.
-        observation_keys: observations to concatenate; by default those of the task, or for an unknown
-            environment ``"observation.environment_state"`` and ``"observation.state"``, if present.
-        image_keys: images to read as well: ``"agentview_image"`` is the feature
-            ``observation.images.agentview``, as pictures or a video. Use ``storage="memmap"`` for many
-            images.
         episodes: numbers of the episodes to read; all by default. Files of other episodes are not needed.
-        filter_key: a mask of the converted file; for this, ``demos``, ``absolute_actions`` and ``**kwargs``
-            see :class:`RobomimicDemonstrations`.
+        **kwargs: options of :class:`RobomimicDemonstrations`. ``observation_keys`` are by default those of
+            the task, or for an unknown environment ``"observation.environment_state"`` and
+            ``"observation.state"``, if present. Of ``image_keys``, ``"agentview_image"`` is the feature
+            ``observation.images.agentview``, as pictures or a video. ``filter_key`` is a mask of the
+            converted file.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
@@ -185,27 +189,16 @@ class LeRobotDemonstrations(DemonstrationReplay):
         *,
         revision: str | None = None,
         env_args: Mapping[str, Any] | None = None,
-        filter_key: str | None = None,
-        demos: int | None = None,
         episodes: Sequence[int] | None = None,
-        observation_keys: Sequence[str] | None = None,
-        image_keys: Sequence[str] = (),
-        absolute_actions: bool = False,
         **kwargs: Any,
     ) -> None:
-        index = read_lerobot_index(
-            dataset,
-            revision=revision,
-            fetch=True,
-            filter_key=filter_key,
-            observation_keys=observation_keys,
-            image_keys=image_keys,
-            poses=absolute_actions,
-            demos=demos,
-            episodes=episodes,
-            env_args=env_args,
-        )
-        super().__init__(index, LeRobotReader(index), absolute_actions=absolute_actions, **kwargs)
+        self._own: dict[str, Any] = {"revision": revision, "env_args": env_args, "episodes": episodes}
+        super().__init__(dataset, **kwargs)
+
+    @contextmanager
+    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+        index = read_lerobot_index(place, fetch=True, **self._own, **chosen)
+        yield index, LeRobotReader(index)
 
 
 def lerobot_steps(

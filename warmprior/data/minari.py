@@ -152,15 +152,15 @@ class MinariReader(DemonstrationReader):
                 observations = observations[part]
         return np.asarray(observations)[:-1]  # the last one follows the last action
 
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
         """Do as the base class describes."""
         values = self._values(demo, key)
-        block = values.reshape(len(values), -1)[first : first + len(out)]
+        block = values.reshape(len(values), -1)[: len(out)]
         if block.shape != out.shape:
             raise DatasetError(
                 f"{self.name(demo, key)} has shape {values.shape}, not {list(out.shape)}: download it again"
             )
-        store_finite(block, out, self.name(demo, key), first, "Delete the episode, or download it again.")
+        store_finite(block, out, self.name(demo, key), "Delete the episode, or download it again.")
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Do as the base class describes."""
@@ -179,7 +179,7 @@ class MinariDemonstrations(DemonstrationReplay):
     last action of an episode is left out.
 
     Args:
-        name: name of the dataset, such as ``"D4RL/door/human-v2"``. A dataset that is not in Minari's folder
+        place: name of the dataset, such as ``"D4RL/door/human-v2"``. A dataset that is not in Minari's folder
             (``MINARI_DATASETS_PATH``) is downloaded.
         observation_keys: observations to concatenate: names in a dictionary space, ``"outer/inner"`` in
             nested ones; all vectors by default.
@@ -187,7 +187,7 @@ class MinariDemonstrations(DemonstrationReplay):
         demos: number of demonstrations to take, from the first on; all by default.
         filter_key: must be ``None``, because there are no masks.
         absolute_actions: must be ``False``, because there are no poses.
-        **kwargs: see :class:`RobomimicDemonstrations`.
+        **kwargs: these and the others as for :class:`RobomimicDemonstrations`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
@@ -200,26 +200,10 @@ class MinariDemonstrations(DemonstrationReplay):
         torch.Size([256, 39])
     """
 
-    def __init__(
-        self,
-        name: str,
-        *,
-        filter_key: str | None = None,
-        demos: int | None = None,
-        observation_keys: Sequence[str] | None = None,
-        image_keys: Sequence[str] = (),
-        absolute_actions: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        index = read_minari_index(
-            name,
-            observation_keys=observation_keys,
-            image_keys=image_keys,
-            demos=demos,
-            filter_key=filter_key,
-            poses=absolute_actions,
-        )
-        super().__init__(index, MinariReader(name, index.path), **kwargs)
+    @contextmanager
+    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+        index = read_minari_index(place, **chosen)
+        yield index, MinariReader(place, index.path)
 
 
 def minari_environment(name: str) -> dict[str, Any] | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -91,8 +93,8 @@ class DemonstrationReader(ABC):
     """A reader of demonstrations' values, given their :class:`DatasetIndex`."""
 
     @abstractmethod
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them.
+    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
+        """Read and check the first rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"``.
 
         Rewards that are not recorded are zeros.
         """
@@ -116,8 +118,14 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
 
 def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] | None:
     """Call :func:`~warmprior.envs.env_args.declared_actions`; raise DatasetError if it fails."""
-    try:
+    with _fitting(path):
         return declared_actions(env_args)
+
+
+@contextmanager
+def _fitting(path: Path) -> Iterator[None]:
+    try:
+        yield
     except Exception as error:  # an unexpected structure can raise anything
         raise DatasetError(f"{path}: env_args do not fit these actions: {error!r}") from error
 
@@ -148,7 +156,7 @@ def pose_keys(action_dim: int) -> list[str]:
     return [f"robot{arm}_eef_{part}" for arm in arms for part in ("pos", "quat")]
 
 
-def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
+def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, first: int = 0) -> None:
     """Copy numbers to ``out``; raise DatasetError if one is not finite there, or above 1e9."""
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)
@@ -264,39 +272,62 @@ def _reserve(mapped: Any) -> None:
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:
     """Read recorded poses, with 6-d rotations instead of rotation vectors."""
     arms = out.shape[-1] // 10
-    for first in range(0, len(out), BLOCK):
-        rows = out[first : first + BLOCK]
-        recorded = np.empty((len(rows), 7 * arms))
-        reader.numbers(demo, "actions", recorded, first)
-        place, turn, gripper = torch.from_numpy(recorded).unflatten(-1, (arms, 7)).split((3, 3, 1), -1)
-        turn = matrix_to_rotation_6d(rotvec_to_matrix(turn))
-        rows[...] = torch.cat((place, turn, gripper), -1).flatten(-2).numpy()
+    recorded = np.empty((len(out), 7 * arms))
+    reader.numbers(demo, "actions", recorded)
+    place, turn, gripper = torch.from_numpy(recorded).unflatten(-1, (arms, 7)).split((3, 3, 1), -1)
+    turn = matrix_to_rotation_6d(rotvec_to_matrix(turn))
+    out[...] = torch.cat((place, turn, gripper), -1).flatten(-2).numpy()
 
 
 def _read_absolute(
     reader: DemonstrationReader, demo: str, out: np.ndarray, output_max: Tensor, base_rotation: Tensor
 ) -> None:
     arms = len(base_rotation)
-    for first in range(0, len(out), BLOCK):
-        rows = out[first : first + BLOCK]
-        deltas, positions, quaternions = (np.empty((len(rows), n * arms)) for n in (7, 3, 4))
-        reader.numbers(demo, "actions", deltas, first)
-        for arm in range(arms):
-            position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
-            reader.numbers(demo, position, positions[:, 3 * arm : 3 * arm + 3], first)
-            turns = quaternions[:, 4 * arm : 4 * arm + 4]
-            reader.numbers(demo, quaternion, turns, first)
-            off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
-            if off.max() > UNIT_TOLERANCE:
-                what, row = reader.name(demo, quaternion), int(off.argmax())
-                raise DatasetError(f"{what} is not a rotation in row {first + row}: its length is not 1")
-        rows[...] = to_absolute(
-            torch.from_numpy(deltas),
-            torch.from_numpy(positions),
-            torch.from_numpy(quaternions),
-            output_max=output_max,
-            base_rotation=base_rotation,
-        ).numpy()
+    deltas, positions, quaternions = (np.empty((len(out), n * arms)) for n in (7, 3, 4))
+    reader.numbers(demo, "actions", deltas)
+    for arm in range(arms):
+        position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
+        reader.numbers(demo, position, positions[:, 3 * arm : 3 * arm + 3])
+        turns = quaternions[:, 4 * arm : 4 * arm + 4]
+        reader.numbers(demo, quaternion, turns)
+        off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
+        if off.max() > UNIT_TOLERANCE:
+            what, row = reader.name(demo, quaternion), int(off.argmax())
+            raise DatasetError(f"{what} is not a rotation in row {row}: its length is not 1")
+    units = {"output_max": output_max, "base_rotation": base_rotation}
+    out[...] = to_absolute(*map(torch.from_numpy, (deltas, positions, quaternions)), **units).numpy()
+
+
+def _conventions(index: DatasetIndex, absolute_actions: bool) -> tuple[Tensor, Tensor] | None:
+    """Return units and frame of the recorded deltas, if actions are made absolute."""
+    if not (index.env_args or absolute_actions):
+        return None
+    with _fitting(index.path):
+        solved(torch.zeros(1), index.env_args)
+        conventions = delta_conventions(index.env_args) if absolute_actions else None
+    if conventions is not None and index.action_dim != (width := 7 * len(conventions[1])):
+        raise DatasetError(f"{index.path}: actions have {index.action_dim} columns, not {width}")
+    return conventions
+
+
+def _actions(
+    index: DatasetIndex,
+    reader: DemonstrationReader,
+    conventions: tuple[Tensor, Tensor] | None,
+    as_recorded: bool,
+) -> Callable[[str, np.ndarray], None]:
+    """Return the function that reads the actions of a demo."""
+    declared = None if as_recorded or not index.env_args else declared_poses(index.path, index.env_args)
+    if _are_poses(index, reader, declared):
+        if conventions is None:
+            raise DatasetError(
+                f"{index.path}: actions are absolute poses, but env_args declare deltas: use "
+                "absolute_actions=True (in a Task: actions='absolute'), or correct control_delta (input_type)"
+            )
+        return partial(_read_poses, reader)
+    if conventions is not None:
+        return partial(_read_absolute, reader, output_max=conventions[0], base_rotation=conventions[1])
+    return lambda demo, out: reader.numbers(demo, "actions", out)
 
 
 def solved(reward: Tensor, env_args: Mapping[str, Any]) -> Tensor:
@@ -345,9 +376,12 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     def __init__(
         self,
-        index: DatasetIndex,
-        reader: DemonstrationReader,
+        place: str | Path,
         *,
+        filter_key: str | None = None,
+        demos: int | None = None,
+        observation_keys: Sequence[str] | None = None,
+        image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
         as_recorded: bool = False,
         storage: Literal["memory", "memmap"] = "memory",
@@ -359,44 +393,25 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         device = torch.device(device)
         if storage == "memmap" and device.type != "cpu":
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
-        action_dim, declared, conventions = index.action_dim, None, None
-        if index.env_args and not as_recorded:
-            declared = declared_poses(index.path, index.env_args)
-        if index.env_args or absolute_actions:
-            try:
-                solved(torch.zeros(1), index.env_args)
-                conventions = delta_conventions(index.env_args) if absolute_actions else None
-            except Exception as error:  # an unexpected structure can raise anything
-                raise DatasetError(f"{index.path}: env_args do not fit these actions: {error!r}") from error
-
-        if conventions is not None:
-            arms = len(conventions[1])
-            if action_dim != 7 * arms:
-                raise DatasetError(f"{index.path}: actions have {action_dim} columns, not {7 * arms}")
-            action_dim = 10 * arms
-        data = _allocate(index, action_dim, storage, scratch_dir)
-        poses = _are_poses(index, reader, declared)
-        if poses and conventions is None:
-            raise DatasetError(
-                f"{index.path}: actions are absolute poses, but env_args declare deltas: use "
-                "absolute_actions=True (in a Task: actions='absolute'), or correct control_delta (input_type)"
-            )
-
-        def read_actions(demo: str, out: np.ndarray) -> None:
-            if poses:
-                _read_poses(reader, demo, out)
-            elif conventions is not None:
-                _read_absolute(reader, demo, out, *conventions)
-            else:
-                reader.numbers(demo, "actions", out)
-
-        _fill(index, data, reader, read_actions)
+        chosen: dict[str, Any] = {"filter_key": filter_key, "observation_keys": observation_keys}
+        chosen |= {"image_keys": image_keys, "poses": absolute_actions, "demos": demos}
+        with self._opened(place, **chosen) as (index, reader):
+            conventions = _conventions(index, absolute_actions)
+            action_dim = index.action_dim if conventions is None else 10 * len(conventions[1])
+            data = _allocate(index, action_dim, storage, scratch_dir)
+            _fill(index, data, reader, _actions(index, reader, conventions, as_recorded))
         self._index = index
         super().__init__(
             storage=TensorStorage(data if storage == "memmap" else data.to(device)),
             writer=ImmutableDatasetWriter(),
             **kwargs,
         )
+
+    @abstractmethod
+    def _opened(
+        self, place: Any, **chosen: Any
+    ) -> AbstractContextManager[tuple[DatasetIndex, DemonstrationReader]]:
+        """Open the demonstrations at a place: their index and a reader of their values."""
 
     @property
     def data(self) -> TensorDictBase:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
-from warmprior.data.replay import DemonstrationReplay
+from warmprior.data.replay import DatasetIndex, DemonstrationReader, DemonstrationReplay
 
 
 class RobomimicDemonstrations(DemonstrationReplay):
@@ -28,7 +28,7 @@ class RobomimicDemonstrations(DemonstrationReplay):
     Names, shapes and masks are checked before values are read.
 
     Args:
-        path: an HDF5 file.
+        place: an HDF5 file.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: number of demos to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
@@ -39,10 +39,12 @@ class RobomimicDemonstrations(DemonstrationReplay):
         absolute_actions: True turns the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm. Recorded poses that
             the file declares as deltas (``low_dim_abs.hdf5``) are not changed.
-        **kwargs: ``as_recorded`` reads such poses without ``absolute_actions`` too, as stored in the file;
-            ``storage`` is ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default temporary
-            ones; ``device`` is that of the tensors in memory; ``batch_size``, ``sampler``, ``transform``,
-            ``prefetch``, ``pin_memory`` and ``generator`` are TorchRL's.
+        as_recorded: True reads such poses without ``absolute_actions`` too, as stored in the file.
+        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default temporary ones.
+        scratch_dir: a folder for memory maps.
+        device: device of the tensors in memory.
+        **kwargs: TorchRL's ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` and
+            ``generator``.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -62,24 +64,8 @@ class RobomimicDemonstrations(DemonstrationReplay):
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        filter_key: str | None = None,
-        demos: int | None = None,
-        observation_keys: Sequence[str] | None = None,
-        image_keys: Sequence[str] = (),
-        absolute_actions: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        index = read_index(
-            path,
-            filter_key=filter_key,
-            observation_keys=observation_keys,
-            image_keys=image_keys,
-            poses=absolute_actions,
-            demos=demos,
-        )
-        with open_robomimic(path) as file:
-            super().__init__(index, RobomimicReader(file), absolute_actions=absolute_actions, **kwargs)
+    @contextmanager
+    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+        index = read_index(place, **chosen)
+        with open_robomimic(place) as file:
+            yield index, RobomimicReader(file)
