@@ -61,8 +61,6 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.training.evaluation import evaluate as play
     from warmprior.training.video import check_video, record_filmstrip
 
-    if args.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
     actor = _policy(args)
     nfes = [actor.sampling.evaluations(nfe) for nfe in args.nfe or [None]]
     if args.grid is not None:

@@ -30,11 +30,27 @@ def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
-def check_positive(**values: float) -> None:
+def check_positive(**values: Any) -> None:
     """Raise ValueError for the first value that is not a finite number > 0."""
+    check_finite_numbers(**values)
     for name, value in values.items():
-        if not (value > 0 and math.isfinite(value)):
-            raise ValueError(f"{name} must be a finite number > 0, got {value}")
+        if value <= 0:
+            raise ValueError(f"{name} must be > 0, got {value}")
+
+
+def check_not_negative(**values: Any) -> None:
+    """Raise ValueError for the first value that is not a finite number >= 0."""
+    check_finite_numbers(**values)
+    for name, value in values.items():
+        if value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
+
+
+def check_share(**values: float) -> None:
+    """Raise ValueError for the first value that is not in [0, 1)."""
+    for name, value in values.items():
+        if not 0 <= value < 1:
+            raise ValueError(f"{name} must be in [0, 1), got {value}")
 
 
 def check_between(low: float, high: float, /, **values: float) -> None:

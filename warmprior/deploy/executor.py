@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
-from itertools import chain
 from threading import RLock
 from types import TracebackType
 from typing import Any, Self, cast
@@ -32,7 +31,7 @@ from warmprior.deploy.observation import RobotObservation
 from warmprior.history import caught_up, cold_history
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.encoder import ImageEncoder
-from warmprior.modules.network import VelocityNetwork, uncompiled
+from warmprior.modules.network import VelocityNetwork, device_of, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
@@ -139,9 +138,8 @@ class AsyncExecutor:
         self.prior, self.execute, self.timeout, self.latency = prior, execute, timeout, latency
         self.actor = actor.eval()
         self._shape = (length, action_dim)
-        weights = chain(actor.parameters(), actor.buffers())
-        device = getattr(plain, "device", None)  # LeRobot's weights are not among the actor's
-        self._device = device or next((value.device for value in weights), torch.device("cpu"))
+        # LeRobot's weights are not among the actor's.
+        self._device = getattr(plain, "device", None) or device_of(actor)
         # Guidance raises an error for delays longer than its horizon.
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
         self._reach = getattr(guidance, "horizon", None) or length

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.checks import check_positive, check_shape, check_whole_numbers
+from warmprior.checks import check_not_negative, check_positive, check_shape, check_whole_numbers
 from warmprior.diagnostics.flow import (
     RunningVariance,
     allowed_nfes,
@@ -353,8 +353,7 @@ class HistoryShift(TensorDictModuleBase):
         self, policy: WarmPriorActor, std: float, *, generator: torch.Generator | None = None
     ) -> None:
         super().__init__()
-        if not std >= 0:
-            raise ValueError(f"std must be >= 0, got {std}")
+        check_not_negative(std=std)
         self.policy, self.std, self.generator = policy, std, generator
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
 

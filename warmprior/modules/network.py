@@ -113,7 +113,7 @@ def velocity_field(
     The observations, ``[B, To, *]`` or a tensordict, are encoded once. The network computes in its own dtype;
     the path is integrated, and its error measured, in that of the actions.
     """
-    dtype, encoding = _precision(network), encoded(network, observation)
+    dtype, encoding = precision_of(network), encoded(network, observation)
     if dtype is None:
         return lambda t, a: network(t, a, encoding)
     return lambda t, a: network(t.to(dtype), a.to(dtype), encoding).to(a.dtype)
@@ -121,7 +121,7 @@ def velocity_field(
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
     """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
-    dtype = _precision(network)
+    dtype = precision_of(network)
 
     def cast(value: Tensor) -> Tensor:
         return value if dtype is None or not value.is_floating_point() else value.to(dtype)
@@ -131,15 +131,18 @@ def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor 
     return inputs if encode is None else encode(inputs)
 
 
-def _precision(network: nn.Module) -> torch.dtype | None:
+def precision_of(module: nn.Module) -> torch.dtype | None:
+    """Return the precision of a module's weights, or ``None`` if it has none."""
     # A frozen network has only buffers.
-    values = chain(network.parameters(), network.buffers())
+    values = chain(module.parameters(), module.buffers())
     return next((value.dtype for value in values if value.is_floating_point()), None)
 
 
-def device_of(network: nn.Module, data: Tensor | TensorDictBase) -> torch.device:
-    """Return the device of a network, or that of ``data`` if the network has no parameters."""
-    return next((p.device for p in network.parameters()), data.device or torch.device("cpu"))
+def device_of(module: nn.Module, data: Tensor | TensorDictBase | None = None) -> torch.device:
+    """Return the device of a module, or that of ``data``, by default the CPU, if it has no weights."""
+    usual = None if data is None else data.device
+    values = chain(module.parameters(), module.buffers())
+    return next((value.device for value in values), usual or torch.device("cpu"))
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.checks import check_finite_numbers, check_keys, check_whole_numbers
+from warmprior.checks import check_keys, check_not_negative, check_share, check_whole_numbers
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
@@ -155,8 +155,7 @@ def integrate(
         2.7083...
     """
     steps = _steps(nfe, solver)
-    if not 0.0 <= start_time < 1.0:
-        raise ValueError(f"start_time must be in [0, 1), got {start_time}")
+    check_share(start_time=start_time)
     tableau = SOLVERS[solver]
     a = a0
     path = [a0]
@@ -218,9 +217,7 @@ class Sampling:
         if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
             raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {self.clip}")
         if self.temperature is not None:
-            check_finite_numbers(temperature=self.temperature)
-            if self.temperature < 0:
-                raise ValueError(f"temperature must be at least 0, got {self.temperature}")
+            check_not_negative(temperature=self.temperature)
 
     def evaluations(self, nfe: int | None = None) -> int:
         """Return ``nfe`` or its default; raise ValueError unless solver and network support that many."""

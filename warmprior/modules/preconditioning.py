@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.checks import check_positions
+from warmprior.checks import check_positions, check_whole_numbers
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
@@ -130,8 +130,7 @@ class SourceMoments(nn.Module):
         if isinstance(windows, TensorDictBase):
             batches = [windows]
         else:
-            if samples < 2:
-                raise ValueError(f"moments need at least 2 samples, got {samples}")
+            check_whole_numbers(2, samples=samples)
             batches = []
             while sum(map(len, batches)) < samples:
                 batches.append(windows.sample())

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from warmprior.checks import check_between, check_finite_numbers, check_shape, check_whole_numbers
+from warmprior.checks import check_between, check_not_negative, check_shape, check_whole_numbers
 from warmprior.history import check_history
 from warmprior.modules.registry import Registered
 
@@ -109,9 +109,7 @@ class Prior(Registered):
     def __init__(self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0) -> None:
         check_whole_numbers(chunk_length=chunk_length)
         sigma = self.default_sigma if sigma is None else sigma
-        check_finite_numbers(sigma=sigma, correlation=correlation)
-        if sigma < 0:
-            raise ValueError(f"sigma must be a finite number >= 0, got {sigma}")
+        check_not_negative(sigma=sigma, correlation=correlation)
         check_between(0.0, 1.0, correlation=correlation)
         self.chunk_length = int(chunk_length)
         self.sigma = float(sigma)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_finite_numbers, check_whole_numbers
+from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
@@ -88,19 +88,13 @@ class RealTimeChunking:
     trust_region: float | None = None
 
     def __post_init__(self) -> None:
-        if self.schedule not in SCHEDULES:
-            raise ValueError(f"unknown schedule {self.schedule!r}; choose one of {', '.join(SCHEDULES)}")
+        check_choice("schedule", self.schedule, SCHEDULES)
         if self.horizon is not None:
             check_whole_numbers(horizon=self.horizon)
-        positive = ("max_guidance_weight", "data_std")
-        numbers = {name: getattr(self, name) for name in (*positive, "sigma", "trust_region")}
-        for name, value in numbers.items():
-            if value is None:
-                continue
-            check_finite_numbers(**{name: value})
-            if value < 0 or (value == 0 and name in positive):
-                least = "> 0" if name in positive else ">= 0"
-                raise ValueError(f"{name} must be {least}, got {value}")
+        check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
+        for name in ("sigma", "trust_region"):
+            if getattr(self, name) is not None:
+                check_not_negative(**{name: getattr(self, name)})
 
     def config(self) -> dict[str, Any]:
         """Return the options as JSON holds them."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import chain
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from warmprior.checks import check_finite_numbers, check_whole_numbers
+from warmprior.checks import check_not_negative, check_whole_numbers
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import device_of
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
@@ -55,9 +55,7 @@ class OTCoupling:
     GROUP: ClassVar[int] = 256
 
     def __init__(self, observation_weight: float = 10.0) -> None:
-        check_finite_numbers(observation_weight=observation_weight)
-        if observation_weight < 0:
-            raise ValueError(f"observation_weight must be at least 0, got {observation_weight}")
+        check_not_negative(observation_weight=observation_weight)
         require("scipy", "sim")
         self.observation_weight = observation_weight
 
@@ -144,10 +142,8 @@ class ReflowCoupling:
             raise ValueError(
                 f"the batch has chunks of {a0.shape[-2]} actions, but the teacher's have {length}"
             )
-        for tensor in chain(self.teacher.parameters(), self.teacher.buffers()):
-            if tensor.device != a0.device:
-                self.teacher.to(a0.device)
-                break
+        if device_of(self.teacher) != a0.device:
+            self.teacher.to(a0.device)
         noise, *_ = ode.in_keys
         data = TensorDict({noise: a0, ode.observation_key: observation}, a0.shape[:-2])
         return a0, ode(data, nfe=self.nfe)[ode.out_keys[0]]

@@ -15,7 +15,13 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
-from warmprior.checks import check_finite, check_finite_numbers, check_positive, check_whole_numbers
+from warmprior.checks import (
+    check_choice,
+    check_finite,
+    check_finite_numbers,
+    check_positive,
+    check_whole_numbers,
+)
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
@@ -90,8 +96,7 @@ class PriorSpaceConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.algorithm not in ("dsrl-na", "dsrl-sac"):
-            raise ValueError(f"algorithm must be dsrl-na or dsrl-sac, got {self.algorithm!r}")
+        check_choice("algorithm", self.algorithm, ("dsrl-na", "dsrl-sac"))
         if self.algorithm == "dsrl-sac" and not self.backup_entropy:
             raise ValueError("dsrl-sac has backup_entropy=True; leave it out")
         if self.algorithm == "dsrl-sac" and self.distillation is not None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +21,7 @@ from warmprior import keys
 from warmprior.checks import check_whole_numbers
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
+from warmprior.modules.network import device_of
 from warmprior.training.parallel import base_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
@@ -98,9 +98,7 @@ def _acting(policy: TensorDictModuleBase, env: EnvBase, seed: int, nfe: int | No
     policy.eval()
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     # A policy without an agent, such as random residuals for a decoder, may have no parameters.
-    home = env.device or torch.device("cpu")
-    tensors = chain(policy.parameters(), policy.buffers())
-    device = next((tensor.device for tensor in tensors), torch.device("cpu"))
+    home, device = env.device or torch.device("cpu"), device_of(policy)
     if "generator" in inspect.signature(policy.forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
         seed ^= 1  # another seed for the environments
@@ -159,14 +157,10 @@ def play_episode(
         >>> bool((one.decisions == again.decisions).all())
         True
     """
-    check_usual_keys(policy, "evaluate")
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
-    for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
-        if value < 0:
-            raise ValueError(f"{name} must be at least 0, got {value}")
-    _check_keys(env, success, measures or {})
-    _check_units(policy, env)
+    check_whole_numbers(0, seed=seed, policy_seed=policy_seed)
+    _check_fit(policy, env, (success, *(measures or {})))
     tally = _Tally(success, measures or {})
     noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
     with _acting(policy, env, int(noise_seed[0]), nfe) as act:
@@ -241,7 +235,6 @@ def evaluate(
     if isinstance(env, Task):
         success, measures = env.success, env.measures
         env = env.env(policy)  # type: ignore[arg-type]
-    check_usual_keys(policy, "evaluate")
     check_whole_numbers(episodes=episodes)
     if len(env.batch_size) > 1:
         raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
@@ -277,8 +270,7 @@ def _play_batched(
     report: Callable[[Episode], None],
 ) -> None:
     num_envs = env.batch_size[0]
-    _check_keys(env, success, measures)
-    _check_units(policy, env)
+    _check_fit(policy, env, (success, *measures))
     home = env.device or torch.device("cpu")
     played = [0] * num_envs
     tallies = [_Tally(success, measures) for _ in played]
@@ -311,9 +303,11 @@ def _play_batched(
                 data = env.reset(data.set("_reset", done.to(home).unsqueeze(-1)))
 
 
-def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
+def _check_fit(policy: TensorDictModuleBase, env: EnvBase, read: Sequence[NestedKey]) -> None:
+    """Raise an error if a policy cannot act in an environment, or that does not write the ``read`` keys."""
+    check_usual_keys(policy, "evaluate")
     present = env.observation_spec.keys(True, True)
-    for key in (success, *measures):
+    for key in read:
         if key not in present and key not in env.reward_keys:
             raise KeyError(
                 f"the environment does not write {key!r}, it writes {sorted(map(str, present))}: name the "
@@ -321,10 +315,6 @@ def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
             )
     if keys.EXECUTED not in present or keys.ACTIONS not in present:
         raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
-
-
-def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
-    """Raise ValueError if the environment lacks the policy's normaliser."""
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
         return  # transforms inside workers cannot be inspected

@@ -13,7 +13,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_share, check_whole_numbers
 from warmprior.modules.network import VelocityNetwork, uncompiled
 
 
@@ -46,8 +46,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
         [0.5, 1.0, 1.0, 0.96, 0.85, 0.69, 0.5, 0.31, 0.15, 0.04]
     """
     check_whole_numbers(iterations=iterations)
-    if not 0.0 <= warmup_ratio < 1.0:
-        raise ValueError(f"warmup_ratio must be in [0, 1), got {warmup_ratio}")
+    check_share(warmup_ratio=warmup_ratio)
     warmup = round(iterations * warmup_ratio)
 
     def factor(step: int) -> float:
@@ -74,8 +73,7 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
         >>> round(average.module.weight.item(), 3)
         0.1
     """
-    if not 0.0 <= rate < 1.0:
-        raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")
+    check_share(rate=rate)
     averaged = _Average(network, multi_avg_fn=partial(_move, rate=rate))
     averaged.module.eval()
     return averaged.requires_grad_(False)

@@ -7,7 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-from warmprior.checks import check_choice, check_finite_numbers, check_positive, check_whole_numbers
+from warmprior.checks import (
+    check_between,
+    check_choice,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_whole_numbers,
+)
 from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
@@ -199,22 +206,14 @@ class TrainingConfig:
         check_whole_numbers(**{name: getattr(self, name) for name in counts})
         if self.save_every is not None:
             check_whole_numbers(save_every=self.save_every)
-        if self.max_grad_norm is not None:
-            check_positive(max_grad_norm=self.max_grad_norm)
         if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # other seeds are offsets from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
-        for name, words, fits in (
-            ("learning_rate", "be > 0", lambda value: value > 0),
-            ("weight_decay", "be >= 0", lambda value: value >= 0),
-            ("self_distillation", "be >= 0", lambda value: value >= 0),
-            ("warmup_ratio", "lie in [0, 1)", lambda value: 0 <= value < 1),
-            ("ema_rate", "lie in [0, 1)", lambda value: 0 <= value < 1),
-            ("cold_probability", "lie in [0, 1]", lambda value: 0 <= value <= 1),
-        ):
-            value = getattr(self, name)
-            check_finite_numbers(**{name: value})
-            if not fits(value):
-                raise ValueError(f"{name} must {words}, got {value}")
+        check_positive(learning_rate=self.learning_rate)
+        if self.max_grad_norm is not None:
+            check_positive(max_grad_norm=self.max_grad_norm)
+        check_not_negative(weight_decay=self.weight_decay, self_distillation=self.self_distillation)
+        check_share(warmup_ratio=self.warmup_ratio, ema_rate=self.ema_rate)
+        check_between(0, 1, cold_probability=self.cold_probability)
         for name, choices in CHOICES.items():
             if getattr(self, name) is not None:
                 check_choice(name, getattr(self, name), choices)

@@ -11,6 +11,7 @@ from functools import partial
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
+from warmprior.checks import check_whole_numbers
 from warmprior.io.workers import end_with_parent, start_method, worker_died
 
 
@@ -51,8 +52,7 @@ def parallel_env(
         >>> env.batch_size, env.is_closed  # the workers start with the first reset
         (torch.Size([2]), True)
     """
-    if num_envs < 1:
-        raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
+    check_whole_numbers(num_envs=num_envs)
     workers = [
         partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
         for i in range(num_envs)

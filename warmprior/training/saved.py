@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import StartPoint, WarmPriorActor
-from warmprior.modules.network import VelocityNetwork, uncompiled, without_compilation
+from warmprior.modules.network import VelocityNetwork, precision_of, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.preconditioning import SourceMoments
 from warmprior.modules.prior import Prior
@@ -126,7 +125,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         "precision": {
             name: str(dtype).removeprefix("torch.")
             for name, part in _parts(actor).items()
-            if (dtype := _dtype(part))
+            if (dtype := precision_of(part))
         },
     }
     try:
@@ -375,7 +374,7 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     for name, precision in config["precision"].items():
         dtype = getattr(torch, precision)
         # Only if it differs, because a part may also hold other types than that of its weights.
-        if _dtype(parts[name]) != dtype:
+        if precision_of(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
 
@@ -386,9 +385,3 @@ def _key(value: Any) -> NestedKey:
     if not parts or not all(isinstance(part, str) for part in parts):
         raise ValueError(f"{value!r} is not a key")
     return tuple(value) if isinstance(value, list) else value
-
-
-def _dtype(part: nn.Module) -> torch.dtype | None:
-    """Return the precision of a part's weights, or ``None`` if it has none."""
-    tensors = chain(part.parameters(), part.buffers())
-    return next((value.dtype for value in tensors if value.is_floating_point()), None)

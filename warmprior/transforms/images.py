@@ -13,7 +13,7 @@ from tensordict.utils import unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 
 from warmprior import keys
-from warmprior.checks import check_keys
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation
 from warmprior.transforms.inner_step import EnvTransform
@@ -57,8 +57,7 @@ class CameraImages(EnvTransform):
         self.cameras = tuple(cameras)
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise ValueError(f"CameraImages needs different cameras, got {list(self.cameras)}")
-        if size < 1:
-            raise ValueError(f"the size of images must be at least 1 pixel, got {size}")
+        check_whole_numbers(size=size)
         self.size = size
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
@@ -233,11 +235,8 @@ def window_replay_buffer(
     prior: Prior,
     *,
     batch_size: int,
-    observation_steps: int = 2,
-    see_history: bool = False,
-    withhold: float = 0.0,
     generator: torch.Generator | None = None,
-    observation_key: NestedKey = keys.OBSERVATION,
+    **options: Any,
 ) -> TensorDictReplayBuffer:
     """Return a replay buffer that samples training windows from demonstrations.
 
@@ -248,12 +247,10 @@ def window_replay_buffer(
         data: contiguous normalised steps ``[N]``, see :class:`ActionWindow`.
         prior: the policy's prior (only its lengths are used).
         batch_size: windows per sample.
-        observation_steps: ``To``.
-        see_history: True if the network sees the last actions.
-        withhold: share of the windows whose history is withheld.
         generator: draws the windows, and those whose history is withheld; PyTorch's global generator by
             default.
-        observation_key: key of the observation.
+        **options: ``observation_steps``, ``see_history``, ``withhold`` and ``observation_key`` of
+            :func:`window_transforms`.
 
     Raises:
         ValueError: if ``batch_size < 1``, or :class:`ActionWindow` rejects the data.
@@ -266,15 +263,7 @@ def window_replay_buffer(
         (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
-    windows = window_transforms(
-        data,
-        prior,
-        observation_steps=observation_steps,
-        see_history=see_history,
-        withhold=withhold,
-        generator=generator,
-        observation_key=observation_key,
-    )
+    windows = window_transforms(data, prior, generator=generator, **options)
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
