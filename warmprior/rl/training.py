@@ -20,11 +20,10 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.checks import check_finite
-from warmprior.io.files import read_tensors, save_file, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
-from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
+from warmprior.training.checkpoint import as_key, check_identity, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate
 from warmprior.training.parallel import watched
 
@@ -53,11 +52,8 @@ class ReplaySegments:
         if not self._pending:
             return
         data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
-        tensors = {
-            json.dumps(key): value.contiguous()  # names may hold any separator
-            for key, value in data.items(True, True)
-        }
-        write_atomic(self._path(self.committed), lambda path: save_file(tensors, path))
+        tensors = {json.dumps(key): value for key, value in data.items(True, True)}  # with any separator
+        save_state(self._path(self.committed), tensors, {})
         self.committed += 1
         self._pending.clear()
 
@@ -65,19 +61,11 @@ class ReplaySegments:
         """Return all committed transitions ``[N]`` or ``None``; raise ValueError for a damaged segment."""
         parts = []
         for index in range(self.committed):
-            path = self._path(index)
-            try:
-                tensors, _ = read_tensors(path.read_bytes())
-            except Exception as error:
-                raise ValueError(
-                    f"{path}, a part of the replay buffer, is missing or damaged ({error}): restore it, "
-                    "or choose another output folder"
-                ) from error
-            size = len(next(iter(tensors.values())))
-            part = TensorDict({}, batch_size=[size])
+            advice = "Restore it, or choose another output folder"
+            tensors, _ = load_state(self._path(index), "part of the replay buffer", advice)
+            part = TensorDict(batch_size=[len(next(iter(tensors.values())))])
             for name, value in tensors.items():
-                key = json.loads(name)
-                part.set(tuple(key) if isinstance(key, list) else key, value)
+                part.set(as_key(json.loads(name)), value)
             parts.append(part)
         return torch.cat(parts) if parts else None
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
@@ -31,8 +32,8 @@ def load_state(
     path: Path, what: str = "training state", advice: str = "Remove it to train again"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read a file of :func:`save_state`, only once, so that the returned values are the checked ones."""
-    check_regular(path)
     try:
+        check_regular(path)
         tensors, metadata = read_tensors(path.read_bytes())
         facts = dict(json.loads(metadata["facts"]))
         if facts.pop("sha256") != digest_of_state(facts, tensors):
@@ -92,6 +93,14 @@ def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> No
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+
+
+def as_key(value: Any) -> NestedKey:
+    """Return a tensordict's key from JSON, which holds nested keys as lists."""
+    parts = value if isinstance(value, list) else [value]
+    if not parts or not all(isinstance(part, str) for part in parts):
+        raise ValueError(f"{value!r} is not a key")
+    return tuple(value) if isinstance(value, list) else value
 
 
 def named(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -28,7 +27,7 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
 from warmprior.modules.trend import RestingAction
-from warmprior.training.checkpoint import load_state, save_state
+from warmprior.training.checkpoint import as_key, load_state, save_state
 
 FORMAT = 7
 """The version of the layout that :func:`save_policy` writes."""
@@ -358,7 +357,7 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     options: dict[str, Any] = dict(config["actor"])
     for name, value in options.items():
         if name.endswith("_key"):
-            options[name] = _key(value)
+            options[name] = as_key(value)
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]
@@ -377,11 +376,3 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
         if precision_of(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
-
-
-def _key(value: Any) -> NestedKey:
-    """Return a tensordict's key from JSON, which holds nested keys as lists."""
-    parts = value if isinstance(value, list) else [value]
-    if not parts or not all(isinstance(part, str) for part in parts):
-        raise ValueError(f"{value!r} is not a key")
-    return tuple(value) if isinstance(value, list) else value
