@@ -21,6 +21,7 @@ from warmprior.checks import (
     check_whole_numbers,
 )
 from warmprior.io.extras import require
+from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config
 
@@ -119,14 +120,8 @@ class ImageEncoder(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """Return the constructor arguments as JSON holds them."""
-        return {
-            "cameras": list(self.cameras),
-            "state_dim": self.state_dim,
-            "image_size": self.image_size,
-            "crop_size": self.crop_size,
-            "backbone": self.backbone,
-            "share": self.share,
-        }
+        names = ("cameras", "state_dim", "image_size", "crop_size", "backbone", "share")
+        return as_json({name: getattr(self, name) for name in names})
 
     def forward(self, observation: TensorDictBase) -> Tensor:
         """Return the vector followed by the cameras' features in order, ``[*B, To, observation_dim]``.
@@ -157,19 +152,9 @@ class ImageEncoder(nn.Module):
             return images[..., room // 2 : room // 2 + size, room // 2 : room // 2 + size]
         if room == 0:
             return images
-        batch, device = len(images), images.device
-        top, left = torch.randint(room + 1, (2, batch, 1), device=device)
-        span = torch.arange(size, device=device)
-        rows, columns = top + span, left + span
-        flat = images.flatten(1, 2)
-        number, channel = (torch.arange(n, device=device) for n in flat.shape[:2])
-        window = flat[
-            number[:, None, None, None],
-            channel[:, None, None],
-            rows[:, None, :, None],
-            columns[:, None, None, :],
-        ]
-        return window.unflatten(1, images.shape[1:3])
+        number = torch.arange(len(images), device=images.device)
+        top, left = torch.randint(room + 1, (2, len(images)), device=images.device)
+        return images.unfold(-2, size, 1).unfold(-2, size, 1)[number, :, :, top, left]
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
