@@ -6,7 +6,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -128,18 +128,10 @@ def push(args: argparse.Namespace) -> None:
 
 
 @dataclass(frozen=True)
-class Train:
-    """Train a policy on demonstrations: python -m warmprior train PLACE [OPTIONS].
-
-    PLACE is a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME.
+class Data:
+    """The options of :meth:`Task.open`.
 
     Attributes:
-        network: options of the velocity network
-        training: options of the recipe
-        prior: source (gaussian, past, preview, or package.module:Class of your own), with options as in
-            past,sigma=0.3
-        chunk: chunk length H
-        nfe: network evaluations per chunk, saved with the policy
         observation_keys: observations of the policy, in this order (default: the task's)
         joint_key: observation of the joint positions that absolute actions target, such as
             observation.state
@@ -148,21 +140,12 @@ class Train:
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
         mask: mask of the file, such as train, whose demonstrations to use (default: all)
         demonstrations: number of demonstrations, from the first on (default: all)
-        held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
-            tenth if no environment is known, else none)
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit (default: ph, and human
             outside robosuite)
         horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
-        out: folder of trainings, in which an interrupted one continues (default: policies)
-        device: device of the network, such as cuda
     """
 
-    network: NetworkOptions
-    training: TrainingConfig
-    prior: str = "past,correlation=0.5"
-    chunk: int = 8
-    nfe: int = DEFAULT_NFE
     observation_keys: tuple[str, ...] | None = None
     joint_key: str | None = None
     image_keys: tuple[str, ...] = ()
@@ -170,10 +153,38 @@ class Train:
     actions: Literal["delta", "absolute"] = "delta"
     mask: str | None = None
     demonstrations: int | None = None
-    held_out: int | None = None
     task: str | None = None
     style: str | None = None
     horizon: int | None = None
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy on demonstrations: python -m warmprior train PLACE [OPTIONS].
+
+    PLACE is a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME.
+
+    Attributes:
+        network: options of the velocity network
+        training: options of the recipe
+        data: options of the demonstrations
+        prior: source (gaussian, past, preview, or package.module:Class of your own), with options as in
+            past,sigma=0.3
+        chunk: chunk length H
+        nfe: network evaluations per chunk, saved with the policy
+        held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
+            tenth if no environment is known, else none)
+        out: folder of trainings, in which an interrupted one continues (default: policies)
+        device: device of the network, such as cuda
+    """
+
+    network: NetworkOptions
+    training: TrainingConfig
+    data: Data
+    prior: str = "past,correlation=0.5"
+    chunk: int = 8
+    nfe: int = DEFAULT_NFE
+    held_out: int | None = None
     out: Path | None = None
     device: str = "cpu"
 
@@ -189,27 +200,15 @@ def train(args: argparse.Namespace) -> None:
         tyro.conf.OmitArgPrefixes[Train],
         prog="python -m warmprior train PLACE",
         args=rest,
-        default=Train(NetworkOptions(), TrainingConfig()),
+        default=Train(NetworkOptions(), TrainingConfig(), Data()),
     )
     prior = make(Prior, options.prior, options.chunk)
     if not place:
         raise ValueError(
             "name the demonstrations first: train FILE.hdf5, lerobot:FOLDER, lerobot:USER/NAME or minari:NAME"
         )
-    whole = Task.open(
-        place,
-        task=options.task,
-        style=options.style,
-        observation_steps=options.network.observation_steps,
-        actions=options.actions,
-        observation_keys=options.observation_keys,
-        joint_key=options.joint_key,
-        image_keys=options.image_keys,
-        fast_rendering=options.fast_rendering,
-        mask=options.mask,
-        demos=options.demonstrations,
-        horizon=options.horizon,
-    )
+    chosen, steps = asdict(options.data), options.network.observation_steps
+    whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
     if whole.environment is not None:
         try:
             whole.check_environment()  # an error is better raised before the training
@@ -239,7 +238,6 @@ def train(args: argparse.Namespace) -> None:
             f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
             f"the mean action has {spread:.4f}:"
         )
-        steps = options.network.observation_steps
         for nfe, error in errors_of(actor, left_out, steps, (1, 3, 9, options.nfe)).items():
             print(f"  NFE {nfe}: {error:.4f}")
     if whole.environment is not None:
