@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from lab.cards import measured
 from lab.command_line import script
 from lab.report import policy_results
 from warmprior.training import load_policy, model_card
@@ -26,9 +27,9 @@ def main(argv: list[str] | None) -> None:
     )
     parser.add_argument("--licence", help="licence of the policy in the hub's spelling, such as mit")
     args = parser.parse_args(argv)
-    results = policy_results(args.run, args.folder)
-    card = model_card(load_policy(args.folder), results, repository=args.repository, licence=args.licence)
-    print(card)
+    results = measured(policy_results(args.run, args.folder))
+    actor = load_policy(args.folder)
+    print(model_card(actor, **results, repository=args.repository, licence=args.licence))
 
 
 if __name__ == "__main__":

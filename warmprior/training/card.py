@@ -1,13 +1,12 @@
-"""The model card of a policy: its parts, its training and its measured success."""
+"""The model card of a policy: its parts, what is known of its training and success, and its use."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from typing import Any
 
-from warmprior.diagnostics.statistics import success_posterior
 from warmprior.io.extras import require
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.saved import policy_config
@@ -15,8 +14,10 @@ from warmprior.training.saved import policy_config
 
 def model_card(
     actor: WarmPriorActor,
-    results: Sequence[Mapping[str, Any]] = (),
     *,
+    task: str | None = None,
+    facts: Mapping[str, str] | None = None,
+    success: str = "Not measured, or not known when this card was written.",
     repository: str = "user/name",
     licence: str | None = None,
 ) -> str:
@@ -24,10 +25,11 @@ def model_card(
 
     Args:
         actor: the policy.
-        results: a row per evaluation, with ``task``, ``data``, ``seed``, ``checkpoint``, ``iterations``,
-            ``nfe``, ``episodes``, ``successes``, and ``demonstrations``, facts about the data.
 
     Keyword Args:
+        task: name of the task; by default that of the environment that the policy keeps.
+        facts: further rows of the first table, such as those of the training.
+        success: the section about success.
         repository: the repository that will hold the policy, such as ``"user/name"``.
         licence: the hub's name of its licence, such as ``"mit"``.
 
@@ -46,65 +48,44 @@ def model_card(
     )
     from warmprior.envs.description import environment_name
 
-    task = results[0]["task"] if results else environment_name(actor)
+    task = task or environment_name(actor)
+    rows = {**_facts(actor), **(facts or {}), "uploaded by": f"warmprior {version('warmprior')}"}
     parts = [
         f"---\n{data.to_yaml()}\n---",
         f"# {actor.prior.name}{f' on {task}' if task else ''}",
         "A flow carries a sample of the source named below to each chunk of actions, after "
         "[WarmPrior](https://sinnnj.github.io/WarmPrior/).",
-        _table(("", ""), _facts(actor, results).items()),
+        table(("", ""), rows.items()),
         "## Success",
-        _success(results),
+        success,
         "## Use",
         _use(actor, repository),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table in Markdown."""
     head = list(head)
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
 
 
-def _code(value: Any) -> str:
+def code(value: Any) -> str:
+    """Return a value as code in a table of Markdown."""
     text = value if isinstance(value, str) else json.dumps(value)
     return f"`{text.replace('|', '/').replace('`', '')}`"
 
 
-def _facts(actor: WarmPriorActor, results: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _facts(actor: WarmPriorActor) -> dict[str, str]:
     config = policy_config(actor)
     count = sum(p.numel() for p in actor.network.parameters())
-    facts = {
-        "source": _code(repr(actor.prior)),
-        "network": f"{count:,} parameters: {_code(config['network'])}",
-        "sampler": _code(config["actor"]),
+    return {
+        "source": code(repr(actor.prior)),
+        "network": f"{count:,} parameters: {code(config['network'])}",
+        "sampler": code(config["actor"]),
         "normaliser": "kept" if actor.normalizer is not None else "none",
-        "environment": _code(config["environment"]) if actor.environment else "not known",
+        "environment": code(config["environment"]) if actor.environment else "not known",
     }
-    if results:
-        row = results[0]
-        steps = f"{row['checkpoint']:,} of {row['iterations']:,} iterations, seed {row['seed']}"
-        facts["training"] = f"{row['task']}, data {row['data']}: {steps}"
-        facts["demonstrations"] = _code(row.get("demonstrations", "not known"))
-    return facts | {"uploaded by": f"warmprior {version('warmprior')}"}
-
-
-def _success(results: Sequence[Mapping[str, Any]]) -> str:
-    if not results:
-        return "Not measured, or not known when this card was written."
-    conditions = [n for n in ("nfe", "delay", "guidance") if n in results[0]]
-    shown = []
-    for row in results:
-        low, high = success_posterior(row["successes"], row["episodes"]).interval(0.95)
-        cells = [str(row[name]) for name in (*conditions, "episodes", "successes")]
-        shown.append([*cells, f"{100 * low:.1f}% to {100 * high:.1f}%"])
-    words = (
-        "NFE is the number of network evaluations per chunk. The interval is from a Beta posterior under a "
-        "uniform prior: it reflects the number of episodes, but not the variation between training seeds."
-    )
-    if results[0].get("demonstrations", {}).get("source") == "scripted":
-        words += " A scripted expert recorded the data: do not compare these with published numbers."
-    return f"{_table((*conditions, 'episodes', 'solved', '95% of the posterior'), shown)}\n\n{words}"
 
 
 def _use(actor: WarmPriorActor, repository: str) -> str:
