@@ -138,6 +138,7 @@ class PriorSpaceTraining:
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
         self.decoder, self.device = self.agent.decoder, self.agent.device
+        self._switch = WarmUpSwitch(self.agent.warmup, self.agent.policy)
         # All transitions fit, because each takes at least one control step.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(config.environment_steps, device=self.device),
@@ -196,7 +197,8 @@ class PriorSpaceTraining:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()
             while self.steps < config.environment_steps:
-                executed = next(rounds)
+                self._switch.learning.fill_(self.steps >= config.warmup_steps)
+                executed = self._keep(next(rounds))
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
@@ -220,30 +222,20 @@ class PriorSpaceTraining:
         env.close(raise_if_closed=False)
 
     @contextmanager
-    def _rounds(self, num_envs: int) -> Iterator[Iterator[int]]:
-        """Collect decisions of all environments; yield the control steps of each round."""
-        if self.collect is None:
-            with self._environment(self._seed()) as env:
-                yield self._collected(env)
+    def _rounds(self, num_envs: int) -> Iterator[Iterator[TensorDictBase]]:
+        """Yield rounds of decisions, each of all environments."""
+        if self.collect is not None:
+            with self.collect(self._switch, self.make_env, num_envs=num_envs, seed=self._seed()) as rounds:
+                yield rounds
             return
-        policy = WarmUpSwitch(self.agent.warmup, self.agent.policy)
-        with self.collect(policy, self.make_env, num_envs=num_envs, seed=self._seed()) as rounds:
-            yield self._received(rounds, policy)
+        with self._environment(self._seed()) as env:
+            yield self._decisions(env)
 
-    def _collected(self, env: EnvBase) -> Iterator[int]:
+    def _decisions(self, env: EnvBase) -> Iterator[TensorDictBase]:
         data = env.reset()
         while True:
-            data, executed = self._collect(env, data)
-            yield executed
-
-    def _received(self, rounds: Iterator[TensorDictBase], policy: WarmUpSwitch) -> Iterator[int]:
-        while True:
-            policy.learning.fill_(self._learns)
-            yield self._keep(next(rounds))
-
-    @property
-    def _learns(self) -> bool:
-        return self.steps >= self.config.warmup_steps
+            decided, data = self._collect(env, data)
+            yield decided
 
     def _seed(self) -> int:
         # Not among the seeds of evaluation and demonstrations; a resumed training plays new episodes.
@@ -252,14 +244,12 @@ class PriorSpaceTraining:
         return 6_000_000 + 100_000 * (self.config.seed % 10)
 
     @torch.no_grad()
-    def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, int]:
-        policy = self.agent.policy if self._learns else self.agent.warmup
+    def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         with set_exploration_type(ExplorationType.RANDOM):
-            data = policy(data.to(self.device)).to(env.device or torch.device("cpu"))
+            data = self._switch(data.to(self.device)).to(env.device or torch.device("cpu"))
         # Checked before a simulator executes them.
         self._check_finite(data.select(keys.DELTA, keys.CHUNK))
-        data, following = env.step_and_maybe_reset(data)
-        return following, self._keep(data)
+        return env.step_and_maybe_reset(data)
 
     def _keep(self, data: TensorDictBase) -> int:
         """Add decisions to the replay buffer; return the number of their control steps."""
