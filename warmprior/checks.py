@@ -12,6 +12,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 
+def given(**values: Any) -> dict[str, Any]:
+    """Return the options that are not ``None``, to be checked."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def check_finite_numbers(**values: Any) -> None:
     """Raise ValueError for the first value that is not a finite number."""
     for name, value in values.items():

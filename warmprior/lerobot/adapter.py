@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_between, check_shape, check_whole_numbers
+from warmprior.checks import check_between, check_shape, check_whole_numbers, given
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
@@ -188,8 +188,7 @@ class WarmPriorAdapter:
             )
         check_between(0, 1, cold_probability=cold_probability)
         self.cold_probability, self.nfe = cold_probability, nfe
-        if nfe is not None:
-            check_whole_numbers(nfe=nfe)
+        check_whole_numbers(**given(nfe=nfe))
         self.guidance = guidance
         if guidance is not None:
             self.source.port.guiding(policy, self._guided)  # raises if the policy cannot be guided

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.checks import check_keys, check_not_negative, check_share, check_whole_numbers
+from warmprior.checks import check_keys, check_not_negative, check_share, check_whole_numbers, given
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
@@ -206,8 +206,7 @@ class Sampling:
     temperature: float | None = None
 
     def __post_init__(self) -> None:
-        counts = {"nfe": self.nfe, "max_nfe": self.max_nfe}
-        check_whole_numbers(**{name: value for name, value in counts.items() if value is not None})
+        check_whole_numbers(**given(nfe=self.nfe, max_nfe=self.max_nfe))
         self.evaluations()
         check_grid(self.grid)
         bounds = self.clip if isinstance(self.clip, Sequence) else (1.0 if self.clip is None else self.clip,)
@@ -216,8 +215,7 @@ class Sampling:
         # A constant dimension is bounded by 0, but not all of them are constant.
         if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
             raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {self.clip}")
-        if self.temperature is not None:
-            check_not_negative(temperature=self.temperature)
+        check_not_negative(**given(temperature=self.temperature))
 
     def evaluations(self, nfe: int | None = None) -> int:
         """Return ``nfe`` or its default; raise ValueError unless solver and network support that many."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers
+from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers, given
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
@@ -89,12 +89,9 @@ class RealTimeChunking:
 
     def __post_init__(self) -> None:
         check_choice("schedule", self.schedule, SCHEDULES)
-        if self.horizon is not None:
-            check_whole_numbers(horizon=self.horizon)
+        check_whole_numbers(**given(horizon=self.horizon))
         check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
-        for name in ("sigma", "trust_region"):
-            if getattr(self, name) is not None:
-                check_not_negative(**{name: getattr(self, name)})
+        check_not_negative(**given(sigma=self.sigma, trust_region=self.trust_region))
 
     def config(self) -> dict[str, Any]:
         """Return the options as JSON holds them."""

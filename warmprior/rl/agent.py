@@ -21,6 +21,7 @@ from warmprior.checks import (
     check_finite_numbers,
     check_positive,
     check_whole_numbers,
+    given,
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
@@ -103,8 +104,7 @@ class PriorSpaceConfig:
             raise ValueError("dsrl-sac has no noise critic: leave distillation out")
         check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)
         check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
-        if self.delta is not None:
-            check_positive(delta=self.delta)
+        check_positive(**given(delta=self.delta))
         for name in ("gamma", "tau"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
@@ -183,6 +183,7 @@ class PriorSpaceAgent:
 
     def _make_loss(self, network: ProbabilisticActor, sizes: dict[str, int]) -> LossModule:
         config = self.config
+        entropy = {"alpha_init": config.alpha_init, "target_entropy": config.target_entropy}
         noise_critic = make_prior_space_critic(
             **sizes, delta=self.decoder.delta, in_keys=(*self.state_keys, keys.DELTA)
         )
@@ -197,17 +198,9 @@ class PriorSpaceAgent:
                 noise_critic_steps=config.noise_critic_steps,
                 distillation=config.distillation,
                 backup_entropy=config.backup_entropy,
-                alpha_init=config.alpha_init,
-                target_entropy=config.target_entropy,
+                **entropy,
             )
-        return SACLoss(
-            network,
-            noise_critic,
-            loss_function="l2",
-            action_spec=network.spec,
-            alpha_init=config.alpha_init,
-            target_entropy=config.target_entropy,
-        )
+        return SACLoss(network, noise_critic, loss_function="l2", action_spec=network.spec, **entropy)
 
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Make the updates for one vector step of the environment, each on its own batch.

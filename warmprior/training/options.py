@@ -14,6 +14,7 @@ from warmprior.checks import (
     check_positive,
     check_share,
     check_whole_numbers,
+    given,
 )
 from warmprior.modules import (
     AdaLNTransformer,
@@ -77,13 +78,11 @@ class NetworkOptions:
     share_encoder: bool = False
 
     def __post_init__(self) -> None:
-        counts = ("hidden_dim", "observation_steps", "crop_size")
-        check_whole_numbers(**{n: value for n in counts if (value := getattr(self, n)) is not None})
+        check_whole_numbers(observation_steps=self.observation_steps, crop_size=self.crop_size)
+        check_whole_numbers(**given(hidden_dim=self.hidden_dim))
         check_choice("network", self.network, _NETWORKS)
-        if self.observation_layers is not None:
-            check_whole_numbers(0, observation_layers=self.observation_layers)
-        if self.time_frequency is not None:
-            check_positive(time_frequency=self.time_frequency)
+        check_whole_numbers(0, **given(observation_layers=self.observation_layers))
+        check_positive(**given(time_frequency=self.time_frequency))
         for name in self._of_transformers():
             able = [key for key, (kind, _) in _NETWORKS.items() if name in inspect.signature(kind).parameters]
             if self.network not in able:
@@ -92,8 +91,7 @@ class NetworkOptions:
                 )
 
     def _of_transformers(self) -> dict[str, Any]:
-        options = {"observation_layers": self.observation_layers, "time_frequency": self.time_frequency}
-        return {name: value for name, value in options.items() if value is not None}
+        return given(observation_layers=self.observation_layers, time_frequency=self.time_frequency)
 
     def without_images(self) -> NetworkOptions:
         """Return a copy with defaults for the options that have no effect without images."""
@@ -204,13 +202,10 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         counts = ("iterations", "batch_size", "checkpoints", "log_every")
         check_whole_numbers(**{name: getattr(self, name) for name in counts})
-        if self.save_every is not None:
-            check_whole_numbers(save_every=self.save_every)
+        check_whole_numbers(**given(save_every=self.save_every))
         if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # other seeds are offsets from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
-        check_positive(learning_rate=self.learning_rate)
-        if self.max_grad_norm is not None:
-            check_positive(max_grad_norm=self.max_grad_norm)
+        check_positive(learning_rate=self.learning_rate, **given(max_grad_norm=self.max_grad_norm))
         check_not_negative(weight_decay=self.weight_decay, self_distillation=self.self_distillation)
         check_share(warmup_ratio=self.warmup_ratio, ema_rate=self.ema_rate)
         check_between(0, 1, cold_probability=self.cold_probability)
