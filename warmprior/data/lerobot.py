@@ -108,7 +108,7 @@ class LeRobotReader(DemonstrationReader):
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Read the first frames of an episode; see the base class."""
         episode, feature = self._episodes[demo], self.index.images[key]
-        video = feature if feature in self.index.metadata.video_keys else None
+        video = feature if feature in self.index.videos else None
         path = self.index.path / episode_file(self.index.metadata, episode, video)
         step = max(1, DECODED // max(1, out[0].numel()))
         with _reading(path):

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -83,11 +83,15 @@ class LeRobotIndex(DatasetIndex):
     described: Mapping[str, Any]
 
     @property
+    def videos(self) -> list[str]:
+        """The features of the selected images that are videos."""
+        return [name for name in self.images.values() if name in self.metadata.video_keys]
+
+    @property
     def files(self) -> list[str]:
         """The files outside ``meta/`` that hold the selection, relative to the folder."""
-        videos = [name for name in self.images.values() if name in self.metadata.video_keys]
         return sorted(
-            {episode_file(self.metadata, e, name) for e in self.episodes for name in [None, *videos]}
+            {episode_file(self.metadata, e, n) for e in self.episodes for n in [None, *self.videos]}
         )
 
     def digest(self) -> str:
@@ -134,10 +138,10 @@ def _metadata(root: Path) -> Any:
             raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
     try:
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
-        whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
-        _check_columns(metadata, whole)
     except Exception as error:  # json, pyarrow, datasets and LeRobot raise different errors
         raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
+    whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
+    _check_columns(root, metadata, whole)
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
     count, frames = metadata.total_episodes, metadata.total_frames
     if not count or numbers != list(range(count)) or steps != frames:
@@ -191,12 +195,15 @@ def _check_info(info: Any) -> str:
     return version
 
 
-def _check_columns(metadata: Any, names: Sequence[str]) -> None:
-    """Raise ValueError unless ``meta/episodes`` has columns of whole numbers of at least 0."""
+def _check_columns(root: Path, metadata: Any, names: Sequence[str]) -> None:
+    """Raise DatasetError unless ``meta/episodes`` has columns of whole numbers of at least 0."""
     for name in names:
         values = metadata.episodes[name] if name in metadata.episodes.column_names else [None]
         if not all(type(value) is int and value >= 0 for value in values):
-            raise ValueError(f"meta/episodes has no whole numbers of at least 0 as {name}")
+            raise DatasetError(
+                f"{root}: meta/episodes has no whole numbers of at least 0 as {name}: download or convert it "
+                "again"
+            )
 
 
 def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
@@ -321,18 +328,8 @@ def read_lerobot_index(
         images={key: cameras[key] for key in image_keys},
         described=described,
     )
-    try:
-        _check_columns(
-            metadata,
-            [
-                f"videos/{name}/{part}_index"
-                for name in index.images.values()
-                if name in metadata.video_keys
-                for part in ("chunk", "file")
-            ],
-        )
-    except ValueError as error:
-        raise DatasetError(f"{root}: {error}: download or convert it again") from error
+    parts = product(index.videos, ("chunk", "file"))
+    _check_columns(root, metadata, [f"videos/{name}/{part}_index" for name, part in parts])
     if fetch and remote and not all((root / file).is_file() for file in index.files):
         index = replace(index, path=download_lerobot(str(dataset), index.files, revision=revision))
     return index

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -340,7 +341,6 @@ class SharedObservations:
 
     def subset(self, index: Tensor) -> SharedObservations:
         """Return the observations with these indices, int64 ``[m]``."""
-        part = object.__new__(SharedObservations)
-        part.__dict__.update(self.__dict__)
+        part = copy.copy(self)
         part.frames, part.episodes = self.frames[index], self.episodes[index]
         return part

@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Composite
 
 from warmprior import keys
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
-from warmprior.transforms.inner_step import KEPT, EnvTransform
+from warmprior.transforms.inner_step import EnvTransform, observed
 
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
 _REACH = 2.0  # metres, the bound of positions in the action spec; it only limits random samples
@@ -90,11 +90,7 @@ class AbsoluteActions(EnvTransform):
         return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # In a partial step of a batched environment the observations are under KEPT.
-        kept = tensordict.get(KEPT, None)
-        pose = tensordict.get(keys.EEF_POSE, None)
-        if pose is None and kept is not None:
-            pose = kept.get(keys.EEF_POSE, None)
+        pose = observed(tensordict, keys.EEF_POSE)
         if pose is None:
             raise KeyError(
                 f"AbsoluteActions needs the gripper's pose at {keys.EEF_POSE!r}: step with what reset or "

@@ -155,6 +155,13 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
             tensordict.del_(key)
 
 
+def observed(tensordict: TensorDictBase, key: NestedKey) -> Any:
+    """Return an observation in a step's input, possibly :func:`set_aside`, or ``None`` if there is none."""
+    kept = tensordict.get(KEPT, None)
+    place = tensordict if kept is None else tensordict.copy().update(kept)
+    return place.get(key, None)
+
+
 def keep_resting(
     tensordict: TensorDictBase, next_tensordict: TensorDictBase, names: Iterable[NestedKey]
 ) -> TensorDictBase:

@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers
-from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
+from warmprior.transforms.inner_step import EnvTransform, observed, set_aside
 
 
 class ObservationStack(EnvTransform):
@@ -52,9 +52,7 @@ class ObservationStack(EnvTransform):
         return tensordict
 
     def _stack(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
-        kept = tensordict.get(KEPT, None)
-        place = tensordict if kept is None else tensordict.copy().update(kept)
-        stack = place.get(self.observation_key, None)
+        stack = observed(tensordict, self.observation_key)
         if stack is None:
             raise KeyError(
                 f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
