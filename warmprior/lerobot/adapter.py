@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_between, check_shape, check_whole_numbers, given
+from warmprior.checks import check_between, check_keys, check_shape, check_whole_numbers, given
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
@@ -366,10 +366,8 @@ class WarmPriorAdapter:
         expected = {"action": len(self.action_indices)}
         if HISTORY in batch:
             expected = {"action": length, HISTORY: history}
-        if missing := [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]:
-            raise KeyError(
-                f"the batch lacks {' and '.join(missing)}: set delta_timestamps of the LeRobotDataset"
-            )
+        needed = [name for key in expected for name in (key, f"{key}_is_pad")]
+        check_keys(batch, needed, "the batch", ": set delta_timestamps of the LeRobotDataset")
         lengths = {key: batch[key].shape[1] for key in expected}
         if lengths != expected:
             raise ValueError(

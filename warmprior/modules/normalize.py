@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
+from warmprior.checks import check_keys
 
 
 class Normalizer(nn.Module):
@@ -78,9 +79,7 @@ class Normalizer(nn.Module):
         """
         if not len(data):
             raise ValueError("cannot fit a normaliser to an empty dataset")
-        missing = [key for key in keys if data.get(key, None) is None]
-        if missing:
-            raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
+        check_keys(data, keys, "Normalizer.fit")
         for key in keys:
             if not isinstance(data[key], Tensor):
                 raise ValueError(

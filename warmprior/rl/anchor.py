@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from warmprior import keys
-from warmprior.checks import check_choice
+from warmprior.checks import check_choice, check_keys
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
@@ -146,8 +146,7 @@ class PriorAnchor(EnvTransform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the anchor."""
         forecast = unravel_key((self.history_key, "forecast"))
-        if forecast not in observation_spec.keys(True, True):
-            raise KeyError(f"PriorAnchor found no {forecast}: append it after ActionHistory")
+        check_keys(observation_spec, [forecast], "PriorAnchor", ": append it after ActionHistory")
         check_unwritten(observation_spec, self.out_keys, "PriorAnchor")
         observation_spec[keys.ANCHOR] = observation_spec[forecast].clone()
         return observation_spec

@@ -123,11 +123,8 @@ class PriorDecoder(TensorDictModuleBase):
             ValueError: if the length or width differs.
         """
         actions = env.full_action_spec
-        if keys.CHUNK not in actions.keys(True, True):
-            raise KeyError(
-                f"the environment takes {list(actions.keys(True, True))}, not {keys.CHUNK}: append "
-                "ChunkStep first"
-            )
+        hint = f" of the actions {list(actions.keys(True, True))}: append ChunkStep first"
+        check_keys(actions, [keys.CHUNK], "PriorDecoder", hint)
         *batch, _, width = actions[keys.CHUNK].shape
         expected = (*batch, self.prediction_length, self.action_dim or width)
         check_shape("the chunk that the environment takes", actions[keys.CHUNK], expected)
@@ -190,10 +187,7 @@ class PriorSpace(EnvTransform):
         return tensordict_reset
 
     def _anchor_of(self, observations: Any) -> Any:
-        if keys.ANCHOR not in observations.keys(True, True):
-            raise KeyError(
-                f"PriorSpace found no {keys.ANCHOR} among the observations: append it after PriorAnchor"
-            )
+        check_keys(observations, [keys.ANCHOR], "PriorSpace", ": append it after PriorAnchor")
         return observations[keys.ANCHOR]
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.checks import check_finite
+from warmprior.checks import check_finite, check_keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
@@ -191,8 +191,7 @@ class PriorSpaceTraining:
             ) as bar,
         ):
             self.decoder.check_env(evaluation_env)
-            if keys.ANCHOR not in evaluation_env.observation_spec.keys(True, True):
-                raise KeyError(f"the environment writes no {keys.ANCHOR}: append PriorAnchor")
+            check_keys(evaluation_env.observation_spec, [keys.ANCHOR], "an agent", ": append PriorAnchor")
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from warmprior import keys
+from warmprior.checks import check_keys
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
 from warmprior.transforms.inner_step import EnvTransform, observed
 
@@ -101,12 +102,9 @@ class AbsoluteActions(EnvTransform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the deltas by absolute poses."""
-        parent = self.parent
-        if parent is not None and keys.EEF_POSE not in parent.observation_spec.keys(True, True):
-            raise KeyError(
-                f"AbsoluteActions found no {keys.EEF_POSE!r} among the observations: make the environment "
-                "with eef_pose=True"
-            )
+        if (parent := self.parent) is not None:
+            hint = ": make the environment with eef_pose=True"
+            check_keys(parent.observation_spec, [keys.EEF_POSE], "AbsoluteActions", hint)
         actions = input_spec["full_action_spec"]
         leaf = actions[keys.ACTION]
         if leaf.shape[-1] != self.arms * _DELTA:

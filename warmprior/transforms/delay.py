@@ -138,8 +138,7 @@ class InferenceDelay(EnvTransform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the delay."""
         (forecast,) = self.in_keys
-        if forecast not in observation_spec.keys(True, True):
-            raise KeyError(f"InferenceDelay found no {forecast}: append it after ActionHistory")
+        check_keys(observation_spec, [forecast], "InferenceDelay", ": append it after ActionHistory")
         check_unwritten(observation_spec, self.out_keys, "InferenceDelay")
         if observation_spec[forecast].ndim > observation_spec.ndim + 2:
             raise ValueError("InferenceDelay and guidance do not support groups of agents: leave them out")

@@ -103,11 +103,8 @@ class ActionHistory(EnvTransform):
 
     def _check_chunk(self) -> TensorSpec:
         actions = self.parent.full_action_spec
-        if self.in_keys[0] not in actions.keys(True, True):
-            raise KeyError(
-                f"ActionHistory found no {self.in_keys[0]} among the actions "
-                f"{list(actions.keys(True, True))}: append it after ChunkStep"
-            )
+        hint = f" of the actions {list(actions.keys(True, True))}: append it after ChunkStep"
+        check_keys(actions, self.in_keys, "ActionHistory", hint)
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
         self._chunk = actions[self.in_keys[0]]
         return self._chunk

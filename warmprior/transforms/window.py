@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
-from warmprior.checks import check_finite_steps, check_whole_numbers
+from warmprior.checks import check_finite_steps, check_keys, check_whole_numbers
 from warmprior.history import window_history
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation, WithheldHistory
@@ -137,13 +137,9 @@ def _checked(
     data: TensorDictBase, observation_key: NestedKey
 ) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
     """Check the data, and return the observation's entries, the action and the episode numbers."""
-    entries = []
-    for key in (observation_key, keys.ACTION, keys.EPISODE):
-        value = data.get(key, None)
-        if value is None:
-            raise KeyError(f"the data lack {key!r}; they hold {sorted(map(str, data.keys(True)))}")
-        entries.append(value)
-    observation, action, episode = entries
+    needed = (observation_key, keys.ACTION, keys.EPISODE)
+    check_keys(data, needed, "ActionWindow", f"; the data hold {sorted(map(str, data.keys(True)))}")
+    observation, action, episode = (data.get(key) for key in needed)
     if data.ndim != 1 or not len(data):
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
     if action.ndim != 2 or action.is_complex():
