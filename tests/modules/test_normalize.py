@@ -93,7 +93,7 @@ def test_errors():
     with raises(ValueError, "action", "NaN"):
         Normalizer.fit(broken)
     one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
-    with raises(ValueError, "a", "(2,)", "(3,)"):
+    with raises(ValueError, "a", "[2]", "[3]"):
         Normalizer(one, two)
     with raises(ValueError, "['a']", "['b']"):
         Normalizer(one, {"b": torch.zeros(2)})

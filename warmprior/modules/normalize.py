@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
-from warmprior.checks import check_keys
+from warmprior.checks import check_keys, check_shape
 
 
 class Normalizer(nn.Module):
@@ -45,10 +45,7 @@ class Normalizer(nn.Module):
             raise ValueError(f"low has the keys {one}, high has {two}")
         self.keys = list(low)
         for key in self.keys:
-            if low[key].shape != high[key].shape:
-                raise ValueError(
-                    f"{key}: low has shape {tuple(low[key].shape)}, high {tuple(high[key].shape)}"
-                )
+            check_shape(f"high of {key}", high[key], low[key].shape)
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
             first, last = (value[key].to(torch.get_default_dtype()) for value in (low, high))

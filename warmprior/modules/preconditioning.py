@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.checks import check_positions, check_whole_numbers
+from warmprior.checks import check_positions, check_shape, check_whole_numbers
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
@@ -240,15 +240,9 @@ class PreconditionedNetwork(VelocityNetwork):
         shape = (network.prediction_length, network.action_dim)
         self.moments = SourceMoments.identity(*shape) if moments is None else moments
         self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
-        parts = {"moments are": self.moments.covariance}
+        check_shape("a moment for the network's chunks", self.moments.covariance, shape)
         if self.trend is not None:
-            parts["trend is"] = self.trend.target
-        for name, value in parts.items():
-            if tuple(value.shape) != shape:
-                raise ValueError(
-                    f"the {name} for chunks (P, d_a) = {tuple(value.shape)}, but the network was built for "
-                    f"{shape}"
-                )
+            check_shape("the trend for the network's chunks", self.trend.target, shape)
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """Encode an observation with the network inside."""

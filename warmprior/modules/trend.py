@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from warmprior import keys
+from warmprior.checks import check_shape
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import Registered, from_config
@@ -96,8 +97,7 @@ class RestingPose(RestingAction):
 
     def __init__(self, columns: Tensor | list[list[int]], normalizer: Normalizer | None = None) -> None:
         columns = torch.as_tensor(columns)
-        if columns.ndim != 2 or columns.shape[1] != _POSE:
-            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
+        check_shape("columns", columns, (len(columns), _POSE))
         super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -130,8 +130,7 @@ class RestingJoints(RestingAction):
 
     def __init__(self, columns: Tensor | list[int], normalizer: Normalizer | None = None) -> None:
         columns = torch.as_tensor(columns)
-        if columns.ndim != 1:
-            raise ValueError(f"columns must be [d_a], got {list(columns.shape)}")
+        check_shape("columns", columns, (columns.numel(),))
         super().__init__(columns, (len(columns),), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from warmprior.checks import check_not_negative, check_whole_numbers
+from warmprior.checks import check_not_negative, check_positions, check_whole_numbers
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
@@ -137,11 +137,8 @@ class ReflowCoupling:
         self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase | None = None
     ) -> tuple[Tensor, Tensor]:
         """Replace the targets by the ends of the teacher's flow."""
-        ode, length = self.teacher.ode, self.teacher.prior.prediction_length
-        if a0.shape[-2] != length:
-            raise ValueError(
-                f"the batch has chunks of {a0.shape[-2]} actions, but the teacher's have {length}"
-            )
+        ode = self.teacher.ode
+        check_positions("a source of the batch", a0, self.teacher.prior)
         if device_of(self.teacher) != a0.device:
             self.teacher.to(a0.device)
         noise, *_ = ode.in_keys

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from warmprior import keys
-from warmprior.checks import check_keys
+from warmprior.checks import check_keys, check_shape
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
 from warmprior.transforms.inner_step import EnvTransform, observed
 
@@ -62,11 +62,8 @@ class AbsoluteActions(EnvTransform):
         # In double precision, like the simulator's: a delta is a small difference of large numbers.
         scale = torch.as_tensor(output_max, dtype=torch.float64)
         rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
-        if scale.shape != (6,) or rotation.ndim != 3 or rotation.shape[1:] != (3, 3):
-            raise ValueError(
-                "AbsoluteActions needs output_max [6] and base_rotation [arms, 3, 3], got "
-                f"{list(scale.shape)} and {list(rotation.shape)}"
-            )
+        check_shape("output_max of AbsoluteActions", scale, (6,))
+        check_shape("base_rotation of AbsoluteActions", rotation, (len(rotation), 3, 3))
         self.register_buffer("scale", scale)
         self.register_buffer("base_rotation", rotation.double())
 
@@ -107,11 +104,8 @@ class AbsoluteActions(EnvTransform):
             check_keys(parent.observation_spec, [keys.EEF_POSE], "AbsoluteActions", hint)
         actions = input_spec["full_action_spec"]
         leaf = actions[keys.ACTION]
-        if leaf.shape[-1] != self.arms * _DELTA:
-            raise ValueError(
-                f"AbsoluteActions for {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but "
-                f"the environment's have {leaf.shape[-1]}"
-            )
+        expected = (*leaf.shape[:-1], self.arms * _DELTA)
+        check_shape(f"the environment's action, for AbsoluteActions of {self.arms} arm(s),", leaf, expected)
         limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)
         limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)
         actions[keys.ACTION] = Bounded(-limit, limit, device=leaf.device)
