@@ -16,10 +16,10 @@ from torch import Tensor
 from warmprior.checks import check_shape
 from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_file, read_lerobot_index
 from warmprior.data.replay import (
-    DatasetError,
     DatasetIndex,
     DemonstrationReader,
     DemonstrationReplay,
+    reading,
     store_finite,
 )
 from warmprior.io.extras import require
@@ -27,21 +27,11 @@ from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
+_AGAIN = (
+    "It is damaged, or from another dataset. Copy, download, record or convert it again; recordings end with "
+    "LeRobotDataset.finalize()."
+)
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn any error during reading into a DatasetError that names the file."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:  # pyarrow's errors, OSError, KeyError for columns, ...
-        raise DatasetError(
-            f"{path}: damaged, or from another dataset ({error}). Copy, download, record or convert it "
-            "again; recordings end with LeRobotDataset.finalize()."
-        ) from error
 
 
 class LeRobotReader(DemonstrationReader):
@@ -70,7 +60,7 @@ class LeRobotReader(DemonstrationReader):
         if file != self._file:  # columns of one file are kept at a time
             self._file, self._read = file, {}
         start, number = episode["dataset_from_index"], episode["episode_index"]
-        with _reading(self.index.path / file):
+        with reading(f"{self.index.path / file}", _AGAIN):
             index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
             first = int(np.searchsorted(index, start))
             rows = slice(first, first + episode["length"])
@@ -111,7 +101,7 @@ class LeRobotReader(DemonstrationReader):
         video = feature if feature in self.index.videos else None
         path = self.index.path / episode_file(self.index.metadata, episode, video)
         step = max(1, DECODED // max(1, out[0].numel()))
-        with _reading(path):
+        with reading(f"{path}", _AGAIN):
             frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
             for first in range(0, len(out), step):
                 part = out[first : first + step]

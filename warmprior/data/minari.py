@@ -20,10 +20,13 @@ from warmprior.data.replay import (
     DemonstrationReplay,
     check_count,
     common_size,
+    reading,
     store_finite,
     unknown,
 )
 from warmprior.io.extras import require
+
+_AGAIN = "Download it again."
 
 SUCCESS_NAMES = ("success", "is_success")
 """The names of success in the ``info`` of Gymnasium's environments."""
@@ -84,7 +87,7 @@ def read_minari_index(
             raise unknown(where, "image", key, pictures)
     check_count(where, demos, dataset.total_episodes)
     episodes = [int(i) for i in dataset.episode_indices][:demos]
-    with _reading(where, "its episodes"):
+    with reading(f"{where}: its episodes", _AGAIN):
         steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
     if not steps or min(steps) < 1:
         raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
@@ -101,15 +104,6 @@ def read_minari_index(
         env_args={},
         task=None,
     )
-
-
-@contextmanager
-def _reading(path: Path, what: str) -> Iterator[None]:
-    """Turn any error during reading into a DatasetError that names the dataset."""
-    try:
-        yield
-    except Exception as error:  # h5py's errors, OSError, KeyError for groups, ...
-        raise DatasetError(f"{path}: {what} cannot be read ({error}): download it again") from error
 
 
 def _spaces(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -139,7 +133,7 @@ class MinariReader(DemonstrationReader):
         self._episode = lru_cache(maxsize=1)(self._read)  # arrays of one episode are read one after another
 
     def _read(self, demo: str) -> Any:
-        with _reading(self._path, f"episode {demo}"):
+        with reading(f"{self._path}: episode {demo}", _AGAIN):
             return next(self._dataset.iterate_episodes([int(demo)]))
 
     def _values(self, demo: str, key: str) -> np.ndarray:
@@ -215,7 +209,7 @@ def minari_environment(name: str) -> dict[str, Any] | None:
     spec = dataset.env_spec
     if spec is None:
         return None
-    with _reading(Path(dataset.spec.data_path), "the first episode"):
+    with reading(f"{dataset.spec.data_path}: the first episode", _AGAIN):
         infos = next(dataset.iterate_episodes()).infos or {}
     return {
         "id": spec.id,

@@ -123,6 +123,17 @@ def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] |
 
 
 @contextmanager
+def reading(what: str, advice: str) -> Iterator[None]:
+    """Turn any error inside into a DatasetError that says what cannot be read, with advice."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
+        raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
+
+
+@contextmanager
 def _fitting(path: Path) -> Iterator[None]:
     try:
         yield

@@ -175,14 +175,10 @@ class PoseTrend(nn.Module):
 
     def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
         super().__init__()
-        shapes = [tuple(value.shape) for value in (centre, source, target)]
-        width = rest.width
-        if source.ndim != 2 or shapes != [(width,), (len(source), width), (len(source), width)]:
-            raise ValueError(
-                f"a trend of {width} actions needs [d_a] and twice [P, d_a], got the shapes {shapes}"
-            )
         self.rest = rest
         for name, value in (("centre", centre), ("source", source), ("target", target)):
+            shape = (rest.width,) if name == "centre" else (len(source), rest.width)
+            check_shape(f"the trend's {name}", value, shape)
             if not torch.isfinite(value).all():
                 raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")
             self.register_buffer(name, value.clone())
