@@ -103,7 +103,7 @@ def test_chunk_lengths_of_two_tasks(tmp_path):
     assert {(row["task"], row["chunk"]) for row in last} == set(product(("drift", "Drift 2"), (1, 8)))
     for row in last:
         assert row["boundary_jump"] > 0 and (row["inner_jump"] is None) == (row["chunk"] == 1)
-    names = ("chunk_lengths_Drift-OWN", "chunk_lengths_Drift-2-OWN-*", "bars", "violins")
+    names = ("chunk_lengths_Drift-Own", "chunk_lengths_Drift-2-Own-*", "bars", "violins")
     assert all(is_png(next(out.glob(f"{name}.png"))) for name in names)
 
 
