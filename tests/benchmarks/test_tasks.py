@@ -155,7 +155,7 @@ def test_a_file_in_mimicgens_environment(tmp_path):
     write_mimicgen(tmp_path / "site")
     file, out = tmp_path / "stack.hdf5", tmp_path / "out"
     write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
-    argv = options(file, out, task=None, prior="past", demonstrations=2)
+    argv = options(file, out, task=None, prior="past", demonstrations=2, time_limit=9)
     script = Path(mimicgen_tasks.__file__)
     path = os.pathsep.join(map(str, (script.parents[1], tmp_path / "site")))
     command, env = [sys.executable, str(script), *argv], os.environ | {"PYTHONPATH": path}
