@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from warmprior.checks import check_whole_numbers
 from warmprior.io.script import ERRORS, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
@@ -61,6 +62,7 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.training.evaluation import evaluate as play
     from warmprior.training.video import check_video, record_filmstrip
 
+    check_whole_numbers(**{"--episodes": args.episodes})
     actor = _policy(args)
     nfes = [actor.sampling.evaluations(nfe) for nfe in args.nfe or [None]]
     if args.grid is not None:
@@ -193,6 +195,8 @@ def train(args: argparse.Namespace) -> None:
     """Train a policy on demonstrations, without playing episodes."""
     import tyro
 
+    from warmprior.envs.rendering import require_rendering
+
     place, *rest = args.options or [""]
     if not place or place.startswith("-"):
         place, rest = "", args.options
@@ -211,8 +215,10 @@ def train(args: argparse.Namespace) -> None:
     whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
     if whole.environment is not None:
         try:
+            if whole.images and "robosuite" in whole.environment:
+                require_rendering()
             whole.check_environment()  # an error is better raised before the training
-        except ImportError as missing:
+        except (ImportError, OSError) as missing:
             print(f"no episodes can be played here, so the policy is only trained: {missing}")
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
@@ -356,7 +362,6 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run command-line arguments, and return the exit code. User errors are reported in one line."""
     args = make_parser().parse_args(argv)
-    # A machine that cannot render or generate data raises a RuntimeError.
     return run_script(lambda: args.run(args), "warmprior", errors=(*ERRORS, RuntimeError))
 
 

@@ -8,7 +8,7 @@ from numbers import Integral
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 
@@ -51,15 +51,17 @@ def check_not_negative(**values: Any) -> None:
             raise ValueError(f"{name} must be >= 0, got {value}")
 
 
-def check_share(**values: float) -> None:
-    """Raise ValueError for the first value that is not in [0, 1)."""
+def check_share(**values: Any) -> None:
+    """Raise ValueError for the first value that is not a number in [0, 1)."""
+    check_finite_numbers(**values)
     for name, value in values.items():
         if not 0 <= value < 1:
             raise ValueError(f"{name} must be in [0, 1), got {value}")
 
 
-def check_between(low: float, high: float, /, **values: float) -> None:
-    """Raise ValueError for the first value that is not in the interval, ends included."""
+def check_between(low: float, high: float, /, **values: Any) -> None:
+    """Raise ValueError for the first value that is not a number in the interval, ends included."""
+    check_finite_numbers(**values)
     for name, value in values.items():
         if not low <= value <= high:
             raise ValueError(f"{name} must be between {low} and {high}, got {value}")
@@ -71,17 +73,23 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(listed)}, got {value!r}")
 
 
-def check_shape(name: str, value: Any, expected: Sequence[int]) -> None:
-    """Raise ValueError if a tensor or array has another shape."""
-    if tuple(value.shape) != tuple(expected):
-        raise ValueError(f"{name} has shape {list(value.shape)}, expected {list(expected)}")
+def check_shape(name: str, value: Any, expected: Sequence[int | str]) -> None:
+    """Raise ValueError if a tensor or array has another shape; a named dimension may have any size."""
+    shape = tuple(value.shape)
+    pairs = zip(shape, expected, strict=False)
+    if len(shape) != len(expected) or any(isinstance(n, int) and size != n for size, n in pairs):
+        raise ValueError(f"{name} has shape {list(shape)}, expected [{', '.join(map(str, expected))}]")
 
 
 def check_keys(place: Any, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
     """Raise KeyError, with a hint, for needed keys that a tensordict or spec lacks."""
-    missing = [key for key in needed if place.get(key, None) is None]
+    needed = list(needed)
+    try:
+        missing = [key for key in needed if place.get(key, None) is None]
+    except (IndexError, ValueError):  # a nested key under an entry that is no group
+        missing = [key for key in needed if unravel_key(key) not in place.keys(True)]
     if missing:
-        raise KeyError(f"{whose} needs the keys {list(needed)}; missing: {missing}{hint}")
+        raise KeyError(f"{whose} needs the keys {needed}; missing: {missing}{hint}")
 
 
 def check_positions(key: NestedKey, chunk: Tensor, prior: Any) -> None:

@@ -15,9 +15,10 @@ import h5py
 
 from lab import render as render_module
 from lab.render import render_demonstrations
-from tests.errors import raises
+from tests.errors import missing, raises
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
+from warmprior.__main__ import main
 from warmprior.data import DatasetError, RobomimicDemonstrations
 from warmprior.data.images import check_images
 from warmprior.data.opening import Demonstrations
@@ -234,16 +235,36 @@ def test_images_upside_down_are_refused(picture):
             compare(fast=True)
 
 
-@pytest.mark.parametrize("missing", ["renderer", "states"])
-def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkeypatch, missing):
+@pytest.mark.parametrize("lacking", ["renderer", "states"])
+def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkeypatch, lacking):
     replaced(picture, lambda images: images[:, ::-1], f"data/demo_0/obs/{IMAGES[0]}")
-    if missing == "renderer":  # as on many servers with GPUs
+    if lacking == "renderer":  # as on many servers with GPUs
         monkeypatch.setattr("warmprior.data.images.rendering_backend", lambda: None)
     else:
         replaced(picture, None, "data/demo_0/states")
     with pytest.warns(UserWarning, match=picture.name) as warned:
         check_images(Demonstrations(picture), CAMERAS, fast=True)
-    assert any(word in str(warned[0].message) for word in (missing, "renders"))
+    assert any(word in str(warned[0].message) for word in (lacking, "renders"))
+
+
+def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, monkeypatch, capsys):
+    for room in ("data.images", "envs.rendering"):
+        monkeypatch.setattr(f"warmprior.{room}.rendering_backend", lambda: None)
+    small = "--encoder small --crop-size 12 --network.hidden-dim 8 --iterations 1 --batch-size 2 --held-out 0"
+    small = small.replace("network.", "").split()
+    argv = [
+        "train",
+        str(picture),
+        "--image-keys",
+        *IMAGES,
+        "--fast-rendering",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    with pytest.warns(UserWarning, match=picture.name):
+        assert main([*argv, *small]) == 0
+    assert not missing(capsys.readouterr().out, "EGL", "only trained")
+    assert list(tmp_path.glob("out/*/policy_000001/model.safetensors"))
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])

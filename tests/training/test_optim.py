@@ -59,3 +59,14 @@ def test_a_compiled_network_has_the_same_groups():
     for one, two in zip(plain.param_groups, compiled.param_groups, strict=True):
         assert one["weight_decay"] == two["weight_decay"]
         assert [id(p) for p in one["params"]] == [id(p) for p in two["params"]]
+
+
+def test_an_average_follows_a_buffer_that_a_network_replaces():
+    network = nn.Linear(1, 1)
+    network.register_buffer("running", torch.zeros(1))
+    average = ema_of(network, 0.5)
+    update = average.update_from(network)
+    for value in (1.0, 2.0):
+        network.running = network.running + value
+        update()
+    assert average.module.running.item() == 3.0

@@ -418,11 +418,11 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             **kwargs,
         )
 
-    @abstractmethod
     def _opened(
         self, place: Any, **chosen: Any
     ) -> AbstractContextManager[tuple[DatasetIndex, DemonstrationReader]]:
         """Open the demonstrations at a place: their index and a reader of their values."""
+        raise NotImplementedError
 
     @property
     def data(self) -> TensorDictBase:

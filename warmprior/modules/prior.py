@@ -109,7 +109,7 @@ class Prior(Registered):
     def __init__(self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0) -> None:
         check_whole_numbers(chunk_length=chunk_length)
         sigma = self.default_sigma if sigma is None else sigma
-        check_not_negative(sigma=sigma, correlation=correlation)
+        check_not_negative(sigma=sigma)
         check_between(0.0, 1.0, correlation=correlation)
         self.chunk_length = int(chunk_length)
         self.sigma = float(sigma)

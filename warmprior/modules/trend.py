@@ -97,7 +97,7 @@ class RestingPose(RestingAction):
 
     def __init__(self, columns: Tensor | list[list[int]], normalizer: Normalizer | None = None) -> None:
         columns = torch.as_tensor(columns)
-        check_shape("columns", columns, (len(columns), _POSE))
+        check_shape("columns", columns, ("arms", _POSE))
         super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ class RestingJoints(RestingAction):
 
     def __init__(self, columns: Tensor | list[int], normalizer: Normalizer | None = None) -> None:
         columns = torch.as_tensor(columns)
-        check_shape("columns", columns, (columns.numel(),))
+        check_shape("columns", columns, ("d_a",))
         super().__init__(columns, (len(columns),), normalizer)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -177,7 +177,7 @@ class PoseTrend(nn.Module):
         super().__init__()
         self.rest = rest
         for name, value in (("centre", centre), ("source", source), ("target", target)):
-            shape = (rest.width,) if name == "centre" else (len(source), rest.width)
+            shape = (rest.width,) if name == "centre" else ("P", rest.width)
             check_shape(f"the trend's {name}", value, shape)
             if not torch.isfinite(value).all():
                 raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")

@@ -91,26 +91,27 @@ class _Average(AveragedModel):
         self.update_from(model)()
 
     def update_from(self, model: nn.Module) -> Callable[[], None]:
-        """Return a function that updates the average from a model that keeps its parameters and buffers.
+        """Return a function that updates the average from a model that keeps its parameters and modules.
 
         It collects them once, which for a large network takes milliseconds.
         """
         averages: list[Tensor] = list(self.module.parameters())
         weights: list[Tensor] = list(model.parameters())
-        return partial(self._update, averages, weights, list(self.module.buffers()), list(model.buffers()))
+        parts = zip(self.module.modules(), model.modules(), strict=True)
+        return partial(self._update, averages, weights, [pair for pair in parts if pair[1]._buffers])
 
     @torch.no_grad()
     def _update(
         self,
         averages: list[Tensor],
         weights: list[Tensor],
-        averaged_buffers: list[Tensor],
-        buffers: list[Tensor],
+        owners: list[tuple[nn.Module, nn.Module]],
     ) -> None:
         if self.n_averaged.item():
             cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
             torch._foreach_copy_(averages, weights)
-        for averaged, buffer in zip(averaged_buffers, buffers, strict=True):
-            averaged.copy_(buffer)
+        for mine, trained in owners:  # a forward pass may replace a buffer
+            for averaged, buffer in zip(mine.buffers(False), trained.buffers(False), strict=True):
+                averaged.copy_(buffer)
         self.n_averaged += 1

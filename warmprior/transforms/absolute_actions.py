@@ -63,7 +63,7 @@ class AbsoluteActions(EnvTransform):
         scale = torch.as_tensor(output_max, dtype=torch.float64)
         rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
         check_shape("output_max of AbsoluteActions", scale, (6,))
-        check_shape("base_rotation of AbsoluteActions", rotation, (len(rotation), 3, 3))
+        check_shape("base_rotation of AbsoluteActions", rotation, ("arms", 3, 3))
         self.register_buffer("scale", scale)
         self.register_buffer("base_rotation", rotation.double())
 
