@@ -1,4 +1,4 @@
-"""What a model card says about a policy of a benchmark: its training and its measured success."""
+"""This module writes a benchmark policy's training and measured success for its model card."""
 
 from __future__ import annotations
 

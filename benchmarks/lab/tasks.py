@@ -164,7 +164,7 @@ class DataOptions:
         if self.obs == "image":
             try:
                 require_rendering()
-            except OSError as error:
+            except ImportError as error:
                 raise ValueError(f"--obs image needs the simulator's images: {error}") from error
             if self.actions == "absolute":
                 raise ValueError("--obs image goes with --actions delta, as in the paper")

@@ -73,7 +73,7 @@ def dataset_policy(found, root, episodes=None, place=None, **options):
 
 
 def moments_by_hand(policy, dataset, episodes):
-    """Of some episodes, normalised by the statistics of all, as LeRobot's processors do."""
+    """Return some episodes, normalised by the statistics of all, as LeRobot's processors do."""
     steps = lerobot_steps(dataset.root, policy.config.observed)
     steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
     low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))

@@ -59,11 +59,13 @@ def rendering_backend() -> str | None:
 
 
 def require_rendering() -> str:
-    """Return the backend that renders here; raise OSError with packages to install if none does."""
+    """Return the backend that renders here; raise ImportError with packages to install if none does."""
     backend = rendering_backend()
     if backend is None:
         require("mujoco", "sim")  # no backend can be tried without mujoco
-        raise OSError("neither EGL nor OSMesa works here: apt-get install libegl1 libegl-mesa0 or libosmesa6")
+        raise ImportError(
+            "neither EGL nor OSMesa works here: apt-get install libegl1 libegl-mesa0 or libosmesa6"
+        )
     return backend
 
 

@@ -83,7 +83,7 @@ class RobosuiteEnv(EnvBase):
         ValueError: if the task is unknown, not exactly one of ``task``, ``env_args`` and ``env`` is given, an
             option is out of range, an observation or camera does not exist, or the lean loop does not support
             the robots.
-        OSError: if ``from_pixels`` is True and this machine cannot render.
+        ImportError: if ``from_pixels`` is True and this machine cannot render.
 
     Examples:
         >>> from warmprior.envs import RobosuiteEnv
@@ -185,7 +185,7 @@ class RobosuiteEnv(EnvBase):
 
         Raises:
             ValueError: if the camera does not exist.
-            OSError: if no OpenGL backend works.
+            ImportError: if no OpenGL backend works.
         """
         size = self.camera_size if size is None else size
         height, width = (size, size) if isinstance(size, int) else size

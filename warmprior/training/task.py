@@ -363,7 +363,7 @@ class Task:
             **options: options of ``make_env``.
 
         Raises:
-            ImportError: if the environment is not installed.
+            ImportError: if the environment is not installed, or its images cannot be rendered here.
             ValueError: if the environment cannot be played, or does not fit the demonstrations.
         """
         env: EnvBase | None = None

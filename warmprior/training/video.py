@@ -124,7 +124,7 @@ def record_filmstrip(
             :func:`play_episode`.
 
     Raises:
-        OSError: if this machine cannot render; the message names the packages to install.
+        ImportError: if this machine cannot render; the message names the packages to install.
         ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
 
     Examples:

@@ -38,7 +38,7 @@ class CameraImages(EnvTransform):
         ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
         KeyError: if the environment does not write its state.
         RuntimeError: if the environment is not a simulator.
-        OSError: if this machine cannot render.
+        ImportError: if this machine cannot render.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
