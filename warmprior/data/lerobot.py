@@ -141,7 +141,7 @@ class LeRobotDemonstrations(DemonstrationReplay):
     own decoder. Without ``next.reward`` the rewards are ``next.success``, or zeros.
 
     Args:
-        dataset: the dataset's folder, or its repository on the hub (``"user/name"``).
+        place: the dataset's folder, or its repository on the hub (``"user/name"``).
         revision: branch, tag or commit of a repository.
         env_args: description of the environment in which the dataset was recorded
             (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
@@ -175,7 +175,7 @@ class LeRobotDemonstrations(DemonstrationReplay):
 
     def __init__(
         self,
-        dataset: str | Path,
+        place: str | Path,
         *,
         revision: str | None = None,
         env_args: Mapping[str, Any] | None = None,
@@ -183,7 +183,7 @@ class LeRobotDemonstrations(DemonstrationReplay):
         **kwargs: Any,
     ) -> None:
         self._own: dict[str, Any] = {"revision": revision, "env_args": env_args, "episodes": episodes}
-        super().__init__(dataset, **kwargs)
+        super().__init__(place, **kwargs)
 
     @contextmanager
     def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
