@@ -337,9 +337,7 @@ class ChunkStep(EnvTransform):
         if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
         chunks = self._chunks(before)
-        next_tensordict = (
-            next_tensordict.clone()
-        )  # an environment may write the next one into the same memory
+        next_tensordict = next_tensordict.clone()  # an environment may write its next one into this memory
         # A plain dictionary, because a tensordict would check its entries at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
