@@ -61,15 +61,15 @@ SMALLEST: dict[str, dict[str, Any]] = {
 class GpuOptions:
     """Options of this script: the parts to run, their policies, and their time."""
 
-    # parts to run (default: all): 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 trainings from states, 5
-    # trainings from images
+    # parts to run (default: all): 0 demonstrations, 1 tests, 2 ratios, 3 speed, 4 training from states, 5
+    # training from images
     part: tuple[int, ...] = ()
     minutes: float | None = None  # time limit of a part in minutes (default: 3 to 7.5)
     preset: str = "paper"  # preset of robomimic.py for network and recipe of parts 4 and 5
     prior: tuple[str, ...] = ("past",)  # methods of parts 4 and 5, which share the time
     episodes: int = 20  # evaluation episodes of part 4, per method and NFE
     device: str = "cuda"  # device of networks and data, such as cuda
-    smallest: bool = False  # run tiny trainings on lift, to try this script
+    smallest: bool = False  # run tiny training runs on lift, to try this script
     out: Path = Path("runs/gpu")  # output folder; also the cache unless $WARMPRIOR_CACHE is set
     commit: str | None = None  # name of this version of the code (default: git describe)
 

@@ -24,7 +24,7 @@ LARGE = ("paper", "much-ado")  # presets for a GPU, whose policies see images
 
 
 def few(name: str, preset: Options) -> Options:
-    """Return a preset with the paper's ten demonstrations, and a training of suitable length."""
+    """Return a preset with the paper's ten demonstrations, and a training run of suitable length."""
     large = name in LARGE
     return with_parts(
         with_parts(preset, **IMAGES[name]) if large else preset,

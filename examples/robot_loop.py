@@ -210,7 +210,7 @@ def demonstrations(camera: bool, rate: float, episodes: int = 40, steps: int = 6
 
 
 def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
-    """Train a small policy, in a few seconds."""
+    """Train a small policy, in a few seconds; a real one needs `joint_key` (docs/your_robot.md)."""
     return train_policy(
         demonstrations(camera, rate),
         PastPrior(CHUNK, correlation=0.5),

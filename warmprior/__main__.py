@@ -36,11 +36,13 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
 
 def info(args: argparse.Namespace) -> None:
     """Print a summary of a saved policy."""
+    from warmprior.deploy.observation import observation_shapes
     from warmprior.envs.description import environment_name
     from warmprior.training.saved import policy_config, policy_file
 
     actor = _policy(args)
     config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
+    shapes = observation_shapes(actor)
     written = policy_file(args.folder, revision=args.revision).get("warmprior", "of an unknown version")
     for name, value in {
         "prior": actor.prior,
@@ -49,7 +51,7 @@ def info(args: argparse.Namespace) -> None:
         "sampler": config["actor"],
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",
-        "images": (actor.environment or {}).get("images", "none"),
+        "observation": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
         "written by": f"warmprior {written}, format {config['format']}",
     }.items():
         print(f"{name:12} {value}")
@@ -176,7 +178,7 @@ class Train:
         nfe: network evaluations per chunk, saved with the policy
         held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
             tenth if no environment is known, else none)
-        out: folder of trainings, in which an interrupted one continues (default: policies)
+        out: folder of training runs, in which an interrupted one continues (default: policies)
         device: device of the network, such as cuda
     """
 

@@ -30,7 +30,7 @@ from lab.options import Run
 from lab.workers import available_cores, fresh_processes
 
 DEATHS = 3  # number of dead workers after which a job counts as failed
-LINES_EVERY = 30.0  # seconds between reports on running trainings, without a terminal
+LINES_EVERY = 30.0  # seconds between reports on training runs, without a terminal
 
 
 @dataclass(eq=False)

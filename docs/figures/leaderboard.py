@@ -88,7 +88,7 @@ def standings() -> DataFrame:
         )
         rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in families.items()}
         lines.append({"source": source, "nfe": nfe, "mean": np.mean(list(rates.values())), **rates})
-        lines[-1]["trainings"] = len(part)
+        lines[-1]["runs"] = len(part)
     frame, draws = DataFrame(lines), np.stack(draws)
     ends = {"mean": draws, "rank": rankdata(-draws, axis=0)}
     frame["rank"] = rankdata(-frame["mean"], "min")
@@ -117,7 +117,7 @@ def draw() -> None:
 def table() -> str:
     """Return the standings in Markdown."""
     names, won_and_lost = ("mean", *FAMILIES), pairs()
-    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | trainings |"]
+    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | runs |"]
     text.append("|---" * (5 + len(names)) + "|")
     for _, row in standings().iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
@@ -126,8 +126,7 @@ def table() -> str:
         rates = [f"{row[name] + 1e-6:.0f}" for name in names]
         cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
         text.append(
-            f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} | "
-            f"{row['trainings']} |"
+            f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} | {row['runs']} |"
         )
     return "\n".join(text) + "\n"
 

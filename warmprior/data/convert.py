@@ -40,7 +40,7 @@ def convert_robomimic(
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
     :doc:`/data` has a table of all entries and features. Numbers become float32. The first simulator state is
-    kept, so that images can be compared with the simulator's before a training. The folder, which is
+    kept, so that images can be compared with the simulator's before training. The folder, which is
     returned, is written atomically: an interrupted call leaves nothing.
 
     Args:

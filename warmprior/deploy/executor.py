@@ -27,11 +27,10 @@ from warmprior.checks import (
     check_shape,
     check_whole_numbers,
 )
-from warmprior.deploy.observation import RobotObservation
+from warmprior.deploy.observation import RobotObservation, observation_shapes
 from warmprior.history import caught_up, cold_history
 from warmprior.modules.actor import check_usual_keys
-from warmprior.modules.encoder import ImageEncoder
-from warmprior.modules.network import VelocityNetwork, device_of, uncompiled
+from warmprior.modules.network import device_of, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
@@ -50,9 +49,9 @@ class AsyncExecutor:
     is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with ``latency`` both return
     the same actions.
 
-    The first step of an episode waits for its chunk. Later, if no action is left, :meth:`act` waits for at
-    most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again. Several threads
-    can share an executor: their calls take turns.
+    The first step of an episode waits for its chunk. Later, if no action is left and no chunk arrives
+    within ``timeout`` seconds, :meth:`act` raises ``TimeoutError``: hold the robot, and call it again.
+    Several threads can share an executor: their calls take turns.
 
     The normaliser, the number of stacked observations, and the observations' names and sizes come from the
     policy. Camera images may have any size: they are resized to the size of the training images, and the
@@ -145,7 +144,7 @@ class AsyncExecutor:
         self._reach = getattr(guidance, "horizon", None) or length
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._postprocess = getattr(plain, "postprocess", None)
-        self._observed = RobotObservation(_shapes(plain, network, prior), self._normalizer)
+        self._observed = RobotObservation(observation_shapes(actor, prior), self._normalizer)
         self._sees_history = keys.CONDITIONED in actor.in_keys
         self._owned = None
         if pool is None and latency is None:
@@ -341,16 +340,3 @@ def _steps(delay: float | None, control_rate: float | None) -> int:
     check_positive(control_rate=control_rate)
     check_finite_numbers(delay=delay)
     return math.ceil(round(delay * control_rate, 6))
-
-
-def _shapes(actor: Any, network: Any, prior: Prior) -> Mapping[str, tuple[int, ...]] | None:
-    """Return the shapes of a policy's observation at one step, by name, or ``None`` if unknown."""
-    if (shapes := getattr(actor, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
-        return shapes
-    encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
-    if encoder is not None or network.encodes:  # a user's own encoder may have no shapes
-        return None if encoder is None else encoder.shapes
-    width = network.observation_dim
-    if keys.CONDITIONED in actor.in_keys:
-        width -= HistoryObservation.width(prior.chunk_length, network.action_dim)
-    return {keys.STATE: (width,)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,15 +13,41 @@ from torch.nn.functional import interpolate
 
 from warmprior import keys
 from warmprior.checks import check_keys, check_shape
+from warmprior.modules.encoder import ImageEncoder
+from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.prior import Prior
+from warmprior.transforms.history import HistoryObservation
+
+
+def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, tuple[int, ...]] | None:
+    """Return the shapes of a policy's observation at one step, by name, or ``None`` if they are unknown.
+
+    Vectors are ``(d,)``, and images ``(3, h, w)`` at the size of the training images.
+
+    Args:
+        actor: the policy.
+        prior: its source; by default ``actor.prior``.
+    """
+    plain = cast(Any, uncompiled(actor))
+    network = getattr(plain, "network", None)
+    network = None if network is None else uncompiled(network)
+    if (shapes := getattr(plain, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
+        return shapes
+    encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
+    if encoder is not None or network.encodes:  # a user's own encoder may have no shapes
+        return None if encoder is None else encoder.shapes
+    width = network.observation_dim
+    if keys.CONDITIONED in actor.in_keys:
+        width -= HistoryObservation.width((prior or plain.prior).chunk_length, network.action_dim)
+    return {keys.STATE: (width,)}
 
 
 class RobotObservation:
     """A converter of raw observations to those of a policy: copies in its units and sizes.
 
     Args:
-        shapes: shapes of the policy's observations by name: vectors ``(d,)`` and images ``(3, h, w)``;
-            ``None`` if they are unknown, and observations are only copied.
+        shapes: see :func:`observation_shapes`; with ``None`` observations are only copied.
         normalizer: normaliser of vectors.
     """
 

@@ -156,7 +156,7 @@ class WarmPriorActor(TensorDictModuleBase):
     It composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. It reads
     the history that :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow` writes, so it
     works unchanged in ``env.rollout``, collectors, batched environments and replay buffers. The flow starts
-    at a random draw of the source; pass a seeded generator to make it reproducible. Under every
+    at a random draw from the source; pass a seeded generator to make it reproducible. Under every
     ``ExplorationType`` but ``RANDOM`` it starts at the mean, unless the policy has a ``temperature``.
 
     Args:
@@ -165,7 +165,7 @@ class WarmPriorActor(TensorDictModuleBase):
         start: the point from which integration starts; the source sample by default.
         guidance: makes chunks continue the one being executed; none by default.
         normalizer: the normaliser of the data. Its :meth:`~warmprior.Normalizer.env_transforms` belong
-            directly after the base environment.
+            after the base environment and what converts its actions and images.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             for ``python -m warmprior evaluate FOLDER``.
         generator: random generator of the sampler, which can also be passed per call: ``actor(data,

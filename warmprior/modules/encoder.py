@@ -274,5 +274,5 @@ class VisionNetwork(VelocityNetwork):
         return self.encoder(observation) if isinstance(observation, TensorDictBase) else observation
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor | TensorDictBase) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         return self.network(t, a, self.encode(observation))

@@ -30,10 +30,10 @@ class _Block(nn.Module):
 class VelocityMLP(VelocityNetwork):
     """A residual multi-layer perceptron on the flattened chunk and observation, modulated by the time.
 
-    The time scales and shifts the input of every block (adaptive layer norm, Peebles and Xie, 2023, without
-    their gate), initially without effect. Training at ``t = 0``, the only time that a one-step sampler
-    evaluates, then interferes little with other times. A separate encoder of the observation lowers the
-    held-out error on robot tasks by 2 to 3 percent. Wrap the network in a
+    The input of every block is scaled and shifted as a function of ``t`` (adaptive layer norm, Peebles and
+    Xie, 2023, without their gate), initially without effect. So training at ``t = 0``, the only time that a
+    one-step sampler evaluates, interferes little with other times. A separate encoder of the observation
+    lowers the held-out error on robot tasks by 2 to 3 percent. Wrap the network in a
     :class:`~warmprior.PreconditionedNetwork` if there are data to fit one.
 
     Args:
@@ -83,7 +83,7 @@ class VelocityMLP(VelocityNetwork):
         self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, chunk))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         time = self.embed_time(t)
         x = self.embed_chunk(a.flatten(1)) + self.encode_observation(observation.flatten(1))
@@ -126,6 +126,6 @@ class PlainMLP(VelocityNetwork):
         self.layers = MLP(inputs, chunk, depth=3, num_cells=hidden_dim, activation_class=nn.GELU)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         return self.layers(t[:, None], a.flatten(1), observation.flatten(1)).view_as(a)

@@ -272,7 +272,7 @@ class PreconditionedNetwork(VelocityNetwork):
         return (alpha * d_beta - d_alpha * beta).abs() * (s0 * self.moments.conditional_deviation)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
         moments = self.moments

@@ -233,9 +233,9 @@ class PreviewPrior(Prior):
     """WP-Preview: the mean is the policy's own earlier forecast of this chunk.
 
     The network predicts ``P = 2H`` actions. In training the forecast is the target's own first ``H`` actions
-    (Eq. 3); at decisions it is positions ``[k, k+H)`` of the previous prediction (Eq. 4). The second half is
-    always cold. At an episode's start the first half is cold too. Algorithm 1 never trains this;
-    :class:`~warmprior.WithheldHistory` does, and it matters for small ``sigma``.
+    (Eq. 3); at decisions it is the next ``H`` actions of the previous prediction (Eq. 4). The second half is
+    always cold. At an episode's start the first half is cold too. Algorithm 1 never trains cold starts;
+    :class:`~warmprior.WithheldHistory` does, which matters for small ``sigma``.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.

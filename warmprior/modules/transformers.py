@@ -126,7 +126,7 @@ class ChiTransformer(VelocityNetwork):
             nn.init.zeros_(module.in_proj_bias)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         memory = torch.cat([self.embed_time(t)[:, None], self.embed_observation(observation)], dim=1)
         memory = self.encoder(memory + self.memory_position)
@@ -224,7 +224,7 @@ class AdaLNTransformer(VelocityNetwork):
         self.head = nn.Sequential(nn.LayerNorm(embedding_dim), nn.Linear(embedding_dim, action_dim))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
-        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         condition = F.silu(self.embed_time(t) + self.embed_observation(observation.flatten(1)))
         tokens = self.embed_action(a) + self.action_position

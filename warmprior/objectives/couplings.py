@@ -19,7 +19,7 @@ Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tens
 """A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
 
 The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
-may have a ``config()``, which a training compares before it is continued, and an ``interpolant`` and
+may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
 ``times``, a path and training times that the loss uses instead of its own.
 """
 

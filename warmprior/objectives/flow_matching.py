@@ -45,26 +45,27 @@ class FlowMatchingLoss(LossModule):
         coupling: a function that pairs the sources and targets of a batch, see :data:`~warmprior.Coupling`;
             by default they are paired in order (Algorithm 1).
         times: the distribution of training times: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`.
+            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`. A
+            coupling that has times, or a path, of its own keeps them.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) leaves errors unchanged. ``"standardised"`` divides them by
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that all
             times, positions and dimensions have equal weight, as in EDM (Karras et al., 2022, Table 1); it is
-            the default for a :class:`PreconditionedNetwork`. With ``"velocity"``, a standard normal source
-            and data with standard deviation :math:`s`, errors at ``t = 0``, the time of one-step samplers,
-            have :math:`s^2` times the weight of those at ``t = 1``.
+            the default for a :class:`PreconditionedNetwork`. For a standard normal source and data of
+            standard deviation :math:`s`, ``"velocity"`` gives errors at ``t = 0``, where one-step samplers
+            evaluate, :math:`s^2` times the weight of those at ``t = 1``.
         interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or linear.
-        reduction: ``"sum"`` (Algorithm 1), ``"mean"`` (that sum over the number of unpadded coordinates, or
-            their total weight) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
+        reduction: ``"sum"`` (Algorithm 1), ``"mean"`` (that sum divided by the number of unpadded
+            coordinates, or by their total weight) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: draws ``t`` and :math:`a_0`; by default that of the actor's sampler.
 
     .. note::
         The loss reads ``chunk`` ``[*B, P, d_a]``, ``history`` (:mod:`warmprior.history`), ``observation``
         ``[*B, To, d_o]`` and, if present, ``pad_mask`` bool ``[*B, P]``, TorchRL's ``priority_weight``
         ``[*B]`` and the masks of its ``loss_mask_key``, such as ``("collector", "mask")`` of padded
-        trajectories. By default these are the keys of :class:`~warmprior.ActionWindow`, even if the policy
-        has other keys; :meth:`set_keys` renames them. Batches are moved to the network's device, where the
-        generator must be too.
+        trajectories. By default these are the keys of :class:`~warmprior.ActionWindow`, with the policy's
+        key of the observation; :meth:`set_keys` renames them. Batches are moved to the network's device,
+        where the generator must be too.
 
     Raises:
         ValueError: if an option is unknown, or does not fit another option, the network or the policy.
@@ -192,7 +193,7 @@ class FlowMatchingLoss(LossModule):
         return None if weight is None else weight.expand(a1.shape[:-1])
 
     def error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
-        """Return the objective's error of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
+        """Return the objective's error ``[*B, P, d_a]`` of velocities predicted at times ``t`` ``[*B]``."""
         error = predicted - velocity
         if self.weighting == "standardised":
             unit = cast(Any, self.actor_network.network).remainder(t.reshape(-1))

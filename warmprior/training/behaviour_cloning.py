@@ -50,15 +50,16 @@ class BehaviourCloning:
     """A run that trains a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
 
     The folder receives ``state.safetensors`` (all that is needed to continue) and a policy with averaged
-    weights per checkpoint, ``policy_000250/`` and so on. Starting it again on the same folder
-    continues it; on a CPU the result is bitwise equal to that of an uninterrupted run with as many threads.
+    weights per checkpoint, ``policy_000250/`` and so on. Starting the run again on the same
+    folder continues it; on a CPU the result is bitwise equal to that of an uninterrupted run with the same
+    number of threads.
 
-    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and runs the
-    same training and draws its own part of every batch, PyTorch's DDP averages the gradients, and only the
+    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and executes
+    the same run and draws its own part of every batch, PyTorch's DDP averages the gradients, and only the
     first process writes.
 
     Args:
-        actor: the policy; its network is trained in place.
+        actor: the policy; its network, and its prior if it has weights, are trained in place.
         data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; on the network's device,
             or on the CPU if they do not fit there.
         config: the recipe.
@@ -69,12 +70,12 @@ class BehaviourCloning:
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
         compile: True compiles the velocity network with :func:`torch.compile`; on a GPU, with CUDA graphs.
-        prefetch: True gathers batches ahead in a thread, drawn by a separate generator. This is always done
+        prefetch: True prefetches batches, drawn by a separate generator, in a thread. This is always done
             if the data are on the CPU and the network is not.
 
     Raises:
         ValueError: if a batch cannot be divided among the processes, the state is damaged or belongs to
-            another training, or the policy could not be loaded again.
+            another run, or the policy could not be loaded again.
         TypeError: if the policy cannot be saved.
 
     Examples:
@@ -247,7 +248,7 @@ class BehaviourCloning:
         return True
 
     def _check_finite(self) -> None:
-        # Checked before every save, and not only before logs: a training cannot resume from a saved NaN.
+        # Checked before every save, and not only before logs: a run cannot resume from a saved NaN.
         losses = torch.stack(self._running)
         finite = bool(torch.isfinite(losses).all())
         if finite and all(bool(torch.isfinite(p).all()) for p in self.update.trained.parameters()):
@@ -325,5 +326,5 @@ class BehaviourCloning:
 
 
 def policy_path(directory: Path, iteration: int) -> Path:
-    """Return the folder of the policy that a training in ``directory`` keeps after an iteration."""
+    """Return the folder of the policy that a run in ``directory`` keeps after an iteration."""
     return directory / f"policy_{iteration:06d}"

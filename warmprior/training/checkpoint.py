@@ -1,4 +1,4 @@
-"""States of trainings and agents on disk, and their identity: one safetensors file each, never a pickle."""
+"""States of training runs and agents on disk, and their identity: a safetensors file each, never a pickle."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None:
-    """Raise ValueError if a state belongs to another training, with the first part that differs."""
+    """Raise ValueError if a state belongs to another run, with the first part that differs."""
     stored = stored if isinstance(stored, dict) else {}
     for part, value in as_json(expected).items():
         saved = stored.get(part)

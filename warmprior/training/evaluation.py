@@ -197,7 +197,7 @@ def evaluate(
             episode after another, see :func:`play_episode`. A batched environment ``[n]`` plays ``n`` at a
             time, and the noise of an episode depends on ``n``. It may come from :func:`parallel_env`, be any
             ``SerialEnv`` or ``ParallelEnv`` (each environment is seeded separately, and must start the same
-            episode after every ``set_seed(seed)``), or have a class with ``strided_seeds = True``: after
+            episode after every ``set_seed(seed)``), or be of a class with ``strided_seeds = True``: after
             ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed + i``,
             ``seed + i + n``, ...
 
@@ -207,15 +207,15 @@ def evaluate(
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
         policy_seed: seed of all draws in this process, from the ``generator`` of a policy that takes one and
             from PyTorch's global generator, whose state is restored afterwards.
-        success: see :func:`play_episode`.
-        measures: see :func:`play_episode`.
+        success: see :func:`play_episode`; a :class:`Task` has its own.
+        measures: see :func:`play_episode`; a :class:`Task` has its own.
         description: label of the progress bar; no bar if ``None``.
 
     Raises:
         ValueError: if ``episodes < 1``; if the environment has several batch dimensions, cannot play given
             seeds in its rows, or adds an offset to them; or if it lacks the policy's normaliser.
         KeyError: see :func:`play_episode`.
-        WorkerError: if a worker process dies, a ``RuntimeError``.
+        WorkerError: a ``RuntimeError``, if a worker process dies.
 
     See Also:
         :func:`~warmprior.diagnostics.success_posterior`: the success rate's posterior distribution.

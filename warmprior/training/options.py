@@ -1,4 +1,4 @@
-"""Options of a training: the network and the recipe."""
+"""Options of a training run: the network and the recipe."""
 
 from __future__ import annotations
 
@@ -143,10 +143,10 @@ CHOICES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The recipe of a training; by default the one of the robot tasks' tables, for a small network on a CPU.
+    """A training recipe; by default that of most tables of robot tasks, for a small network on a CPU.
 
-    The defaults were chosen from success against iterations. PAPER is the paper's recipe. Raises ValueError
-    if a number is out of range.
+    The defaults were chosen by success after several numbers of iterations. PAPER is the paper's recipe.
+    Raises ValueError if a number is out of range.
 
     Attributes:
         iterations: gradient steps.
@@ -154,11 +154,10 @@ class TrainingConfig:
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
         warmup_ratio: share of the iterations over which the learning rate rises.
-        max_grad_norm: largest norm of the gradient of all weights, to which longer ones are clipped; no limit
-            by default.
+        max_grad_norm: norm of the gradient of all weights above which it is clipped; no limit by default.
         ema_rate: decay of the averaged weights that are evaluated.
         checkpoints: largest number of policies to keep, evenly spaced, the last at the end.
-        save_every: iterations between saves of the training state, ten per checkpoint by default.
+        save_every: iterations between saves of the training state; by default ten saves per checkpoint.
         log_every: iterations per logged mean loss.
         seed: seed of initial weights, sampling, source, times and dropout.
         times: distribution of the times of the loss.
@@ -166,12 +165,12 @@ class TrainingConfig:
         weighting: weighting of the loss: errors unchanged (velocity), or divided by the standard deviation
             that preconditioning leaves, so that all times have equal weight (standardised). The latter is the
             default for a preconditioned network.
-        self_distillation: weight of the loss that trains one step to end where the flow of averaged weights
-            ends.
+        self_distillation: weight of the loss that trains one integration step to end where the averaged
+            weights' flow does.
         count_padding: let actions past an episode's end, where its last one is repeated, count in the loss.
         precision: precision of the network's matrix products in training; weights, averages and optimiser are
             float32.
-        cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
+        cold_probability: share of the windows whose history is withheld; Algorithm 1 withholds none.
 
     Examples:
         >>> from warmprior.training import TrainingConfig

@@ -1,4 +1,4 @@
-"""Placement of a training's demonstrations, and the way of batches from there to the network."""
+"""Placement of a training run's demonstrations, and the way of batches from there to the network."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Prefetch:
     """A source of batches that a thread gathers one step ahead, and pins for a GPU.
 
     Unlike TorchRL's prefetching, it keeps the generator's state after the batch that it returned last, so
-    that a training can be continued. Nothing else may draw from the generator.
+    that a training run can be continued. Nothing else may draw from the generator.
     """
 
     def __init__(

@@ -152,7 +152,7 @@ def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, 
 def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return configuration and weights to save, after checking that :func:`load_policy` could load them.
 
-    Raises TypeError or ValueError if it could not; call it before a training whose result would be lost.
+    Raises TypeError or ValueError if it could not; call it before a training run whose result would be lost.
     """
     config = policy_config(actor)
     tensors = without_compilation(actor.state_dict())

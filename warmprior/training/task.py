@@ -236,7 +236,7 @@ class Task:
             if horizon is not None:
                 environment["max_episode_steps"] = horizon
             description = registered_description(environment, observation_steps)
-            # Unknown wrappers raise an error only when it is built, which a training does not need.
+            # Unknown wrappers raise an error only when it is built, which training does not need.
             recorded: Any = partial(registered_env, environment)
             return replace(opened, facts=facts, make_env=recorded, environment=description)
         style, cameras = style or "ph", [key.removesuffix("_image") for key in image_keys]

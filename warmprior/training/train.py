@@ -96,9 +96,9 @@ def train_policy(
 ) -> WarmPriorActor:
     """Train a policy on demonstrations with a source, by behaviour cloning.
 
-    The defaults are those of the documentation's tables: a :class:`VelocityMLP` that is preconditioned for
-    the source and the demonstrations, and the recipe of :class:`TrainingConfig`. CPU training uses one thread
-    so that results are reproducible.
+    The defaults are those of most of the documentation's tables: a :class:`VelocityMLP` that is
+    preconditioned for the source and the demonstrations, and the recipe of :class:`TrainingConfig`. CPU
+    training uses one thread so that results are reproducible.
 
     Args:
         demonstrations: a file or dataset that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
@@ -109,8 +109,8 @@ def train_policy(
             :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training run is lost.
 
     Keyword Args:
-        observation_keys: observations to read from it, see :meth:`Task.open`.
-        image_keys: images to read from it, see :meth:`Task.open`.
+        observation_keys: observations to read from the file or dataset, see :meth:`Task.open`.
+        image_keys: images to read from the file or dataset, see :meth:`Task.open`.
         nfe: network evaluations per chunk, saved with the policy; 3 by default.
         network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.

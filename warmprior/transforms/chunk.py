@@ -180,22 +180,21 @@ class ChunkStep(EnvTransform):
     run only at the steps that a chunk's last observation depends on. In a partial step, rows that are not
     stepped keep all observations.
 
-    An environment without batch dimensions may take all steps of a chunk in one call, as
+    An environment without batch dimensions may take all steps of a chunk but the first in one call, as
     :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It needs a method
-    ``control_steps(actions, keep)``, defined in the class that defines ``_step``: it executes raw actions
-    ``[n, d_a]`` until the episode ends and returns one tensordict per step, complete for the last ``keep``,
-    and before that with reward, flags and ``"success"`` only.
+    ``control_steps(actions, keep)``, defined in the class that defines ``_step``, which executes raw actions
+    ``[n, d_a]`` until the episode ends and returns one tensordict per step: the last ``keep`` complete, the
+    earlier ones with reward, flags and ``"success"`` only.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
-        ``VecNormV2``, update it in all rows, including those that a partial step leaves out. If rows stay out
-        beyond their reset, place such transforms inside the workers.
+        ``VecNormV2``, update it in all rows, including those that a partial step leaves out. If rows still
+        sit out steps after their reset, place such transforms inside the workers.
         :class:`ObservationStack` has no such memory.
 
     Args:
         chunk_length: ``H``.
-        execute: ``k``, the number of actions of a chunk that are executed before the next decision; ``H`` by
-            default.
+        execute: number of actions of a chunk that are executed before the next decision; ``H`` by default.
         prediction_length: ``P``, the length of the policy's chunks; ``H`` by default.
         gamma: discount per control step.
         success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
@@ -211,7 +210,7 @@ class ChunkStep(EnvTransform):
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
             or there are not as many chunk keys as action keys.
         KeyError: (in an environment) unless ``action_keys`` name exactly its actions.
-        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, skips
+        RuntimeError: (at the first reset) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
             episode.
 

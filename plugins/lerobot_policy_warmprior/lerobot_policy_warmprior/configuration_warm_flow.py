@@ -31,7 +31,7 @@ class WarmupRatioConfig(LRSchedulerConfig):
     warmup_ratio: float = 0.2
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """Make the schedule of a training with that many steps."""
+        """Make the schedule of a training run with that many steps."""
         return warmup_cosine(optimizer, num_training_steps, self.warmup_ratio)
 
 
@@ -103,7 +103,7 @@ class WarmFlowConfig(PreTrainedConfig):
         )
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
-        """Return the options that saved weights depend on; a training may change the source."""
+        """Return the options that saved weights depend on; a training run may change the source."""
         names = "n_obs_steps precondition network embedding_dim num_layers num_heads image_size crop_size"
         return {
             **{name: getattr(self, name) for name in (*names.split(), "normalization_mapping")},

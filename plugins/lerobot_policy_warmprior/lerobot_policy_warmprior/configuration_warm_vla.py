@@ -48,7 +48,7 @@ class WarmConfigMixin:
         return build(kind, self.prior, room if self.prior_chunk is None else self.prior_chunk)
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
-        """Return the options that saved weights depend on; a training may change the source."""
+        """Return the options that saved weights depend on; a training run may change the source."""
         if training:
             return {}
         unit = {"sigma_unit": self.sigma_unit, "action_std": self.action_std}

@@ -43,7 +43,7 @@ from warmprior.training import ema_of, precondition
 
 
 def training_episodes(meta: Any) -> list[int] | None:
-    """Return the numbers of the episodes that a training reads; ``None`` for all.
+    """Return the numbers of the episodes that training reads; ``None`` for all.
 
     LeRobot gives a policy only the metadata of all episodes, so the dataset that holds them is searched.
     """
@@ -55,7 +55,7 @@ def training_episodes(meta: Any) -> list[int] | None:
 class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
 
-    In a training, preconditioning is fitted to the training episodes of the dataset of ``dataset_meta``, even
+    In training, preconditioning is fitted to the training episodes of the dataset of ``dataset_meta``, even
     if the training continues from a saved policy.
 
     Raises:
@@ -169,7 +169,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         )
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
-        """Load weights, and keep moments that were fitted to a training's data."""
+        """Load weights, and keep moments that were fitted to the training data."""
         return super().load_state_dict({**state_dict, **self._fitted}, *args, **kwargs)
 
     def update(self) -> None:

@@ -22,7 +22,7 @@ class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     def from_pretrained(
         cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
     ) -> Self:
-        """Load a saved policy; a ``ValueError`` if a training that continues it has another history."""
+        """Load a saved policy; a ``ValueError`` if a run that continues its training has another history."""
         if config is not None and config.pretrained_path:  # LeRobot takes the processors as well
             hub = {name: kwargs[name] for name in HUB if name in kwargs}
             check_pretrained(config, str(pretrained_name_or_path), revision=revision, **hub)

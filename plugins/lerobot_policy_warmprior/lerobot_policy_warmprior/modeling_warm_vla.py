@@ -22,7 +22,7 @@ REAL_TIME = ("inference_delay", LEFT_OVER, "execution_horizon")
 class WarmPolicyMixin(WholePolicy):
     """Base class in front of a policy of LeRobot, so that its losses and chunks start from the prior.
 
-    ``dataset_stats`` and ``dataset_meta`` are those of a training's dataset, which give ``action_std``.
+    ``dataset_stats`` and ``dataset_meta`` are those of the training dataset, which give ``action_std``.
     """
 
     warm_adapter: Any
