@@ -15,7 +15,7 @@ from warmprior import Prior
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "notes").iterdir())]
-GIVEN = re.compile(r"# Given: ([\w, ]+); .*\.\n")
+GIVEN = re.compile(r"# Given: ([\w, ]+) \(.*\)\.\n")
 TRAINED = "iterations=1_000"
 """Only the long programs have this; tests/test_quickstart.py shortens them."""
 

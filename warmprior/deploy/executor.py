@@ -43,11 +43,11 @@ class AsyncExecutor:
 
     Every ``execute`` control steps a decision begins in a thread, with the observation of that step. Until
     its chunk is ready, the robot continues the old one; the new chunk takes effect at the position that the
-    robot has reached. The policy expects the largest delay of the recent decisions (``("rtc", "delay")``, for
-    :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) is always current, even if a
-    decision is late: it holds each executed action and the rest of the chunk, which is empty once the chunk
-    is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with ``latency`` both return
-    the same actions.
+    robot has reached. The policy assumes the largest recent delay (``("rtc", "delay")``, for
+    :class:`~warmprior.RealTimeChunking`). At every decision, late or not, the history
+    (:mod:`warmprior.history`) holds the last executed actions and the rest of the chunk, which is empty once
+    the chunk is used up. :class:`~warmprior.InferenceDelay` does the same in simulation; with ``latency``
+    both return the same actions.
 
     The first step of an episode waits for its chunk. Later, if no action is left and no chunk arrives
     within ``timeout`` seconds, :meth:`act` raises ``TimeoutError``: hold the robot, and call it again.
@@ -160,13 +160,13 @@ class AsyncExecutor:
 
     @property
     def delays(self) -> tuple[int, ...]:
-        """The delays of the last decisions in control steps, except first decisions of episodes."""
+        """The last decisions' delays in control steps, except each episode's first."""
         with self._lock:
             return tuple(self._delays)
 
     @property
     def expected_delay(self) -> int:
-        """The delay that the next decision expects, the largest of :attr:`delays` or else ``delay``."""
+        """The delay that the next decision assumes: the largest of :attr:`delays`, or ``delay`` if empty."""
         return max(self.delays, default=self._expected)
 
     def reset(self) -> None:

@@ -46,15 +46,16 @@ class FlowMatchingLoss(LossModule):
             by default they are paired in order (Algorithm 1).
         times: the distribution of training times: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
             ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`. A
-            coupling that has times, or a path, of its own keeps them.
+            coupling's own times take precedence.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) leaves errors unchanged. ``"standardised"`` divides them by
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that all
             times, positions and dimensions have equal weight, as in EDM (Karras et al., 2022, Table 1); it is
             the default for a :class:`PreconditionedNetwork`. For a standard normal source and data of
-            standard deviation :math:`s`, ``"velocity"`` gives errors at ``t = 0``, where one-step samplers
-            evaluate, :math:`s^2` times the weight of those at ``t = 1``.
-        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or linear.
+            standard deviation :math:`s`, ``"velocity"`` weights errors at ``t = 0``, where one-step samplers
+            evaluate, by :math:`s^2` relative to ``t = 1``.
+        interpolant: the path; by default that of the coupling or the
+            :class:`~warmprior.PreconditionedNetwork` if they have one, else linear.
         reduction: ``"sum"`` (Algorithm 1), ``"mean"`` (that sum divided by the number of unpadded
             coordinates, or by their total weight) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: draws ``t`` and :math:`a_0`; by default that of the actor's sampler.
@@ -64,7 +65,7 @@ class FlowMatchingLoss(LossModule):
         ``[*B, To, d_o]`` and, if present, ``pad_mask`` bool ``[*B, P]``, TorchRL's ``priority_weight``
         ``[*B]`` and the masks of its ``loss_mask_key``, such as ``("collector", "mask")`` of padded
         trajectories. By default these are the keys of :class:`~warmprior.ActionWindow`, with the policy's
-        key of the observation; :meth:`set_keys` renames them. Batches are moved to the network's device,
+        observation key; :meth:`set_keys` renames them. Batches are moved to the network's device,
         where the generator must be too.
 
     Raises:

@@ -143,9 +143,9 @@ CHOICES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """A training recipe; by default that of most tables of robot tasks, for a small network on a CPU.
+    """A training recipe; by default that of most result tables, for a small network on a CPU.
 
-    The defaults were chosen by success after several numbers of iterations. PAPER is the paper's recipe.
+    The defaults were chosen by success rate at several iteration counts. PAPER is the paper's recipe.
     Raises ValueError if a number is out of range.
 
     Attributes:
@@ -154,7 +154,7 @@ class TrainingConfig:
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
         warmup_ratio: share of the iterations over which the learning rate rises.
-        max_grad_norm: norm of the gradient of all weights above which it is clipped; no limit by default.
+        max_grad_norm: norm above which the gradient of all weights is clipped; no limit by default.
         ema_rate: decay of the averaged weights that are evaluated.
         checkpoints: largest number of policies to keep, evenly spaced, the last at the end.
         save_every: iterations between saves of the training state; by default ten saves per checkpoint.

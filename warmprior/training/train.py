@@ -103,15 +103,16 @@ def train_policy(
     Args:
         demonstrations: a file or dataset that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
             ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
-            them, as :meth:`Task.of` takes them; or a :class:`Task`.
+            them, in :meth:`Task.of`'s format; or a :class:`Task`.
         prior: the source distribution.
-        directory: folder in which the training is saved, and from which it continues, see
-            :class:`BehaviourCloning`; if omitted, nothing is saved and an interrupted training run is lost.
+        directory: folder where the run is saved and resumed, see :class:`BehaviourCloning`; if omitted,
+            nothing is saved and an interrupted run is lost.
 
     Keyword Args:
         observation_keys: observations to read from the file or dataset, see :meth:`Task.open`.
         image_keys: images to read from the file or dataset, see :meth:`Task.open`.
-        nfe: network evaluations per chunk, saved with the policy; 3 by default.
+        nfe: network evaluations per chunk, saved with the policy; 3 by default, or what the
+            solver and ``max_nfe`` allow.
         network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
         start: the point from which integration starts; the source sample by default.

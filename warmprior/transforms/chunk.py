@@ -180,17 +180,17 @@ class ChunkStep(EnvTransform):
     run only at the steps that a chunk's last observation depends on. In a partial step, rows that are not
     stepped keep all observations.
 
-    An environment without batch dimensions may take all steps of a chunk but the first in one call, as
-    :class:`~warmprior.envs.RobosuiteEnv` does at twice the speed. It needs a method
+    An environment without batch dimensions may take all but a chunk's first step in one call, which
+    doubles the speed of :class:`~warmprior.envs.RobosuiteEnv`. It needs a method
     ``control_steps(actions, keep)``, defined in the class that defines ``_step``, which executes raw actions
     ``[n, d_a]`` until the episode ends and returns one tensordict per step: the last ``keep`` complete, the
     earlier ones with reward, flags and ``"success"`` only.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
-        ``VecNormV2``, update it in all rows, including those that a partial step leaves out. If rows still
-        sit out steps after their reset, place such transforms inside the workers.
-        :class:`ObservationStack` has no such memory.
+        ``VecNormV2``, update that memory in all rows, including those that a partial step leaves out. If rows
+        may skip steps after a reset, place such transforms inside the workers. :class:`ObservationStack` has
+        no such memory.
 
     Args:
         chunk_length: ``H``.
@@ -209,7 +209,7 @@ class ChunkStep(EnvTransform):
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
             or there are not as many chunk keys as action keys.
-        KeyError: (in an environment) unless ``action_keys`` name exactly its actions.
+        KeyError: if ``action_keys`` are not exactly the environment's actions.
         RuntimeError: (at the first reset) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
             episode.
