@@ -38,12 +38,15 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
             ]
         plot_success(seeds, out / f"success{suffix}.png", title=title)
         label = dict(zip(task_rows.policy, task_rows.method, strict=True))
-        losses: dict[str, list[list[tuple[int, float]]]] = {}
-        for policy in played:
-            losses.setdefault(label[policy.name], []).append(policy.losses)
         fewest = at_fewest(task_rows)
         fewest = fewest[fewest.temperature == fewest.groupby("method").temperature.transform("max")]
-        plot_learning_curves(losses, fewest, out / f"learning_curves{suffix}.png", title=title)
+        if removed := [str(policy.state) for policy in played if not policy.state.is_file()]:
+            print(f"No learning curves: {removed[0]} has been removed")
+        else:
+            losses: dict[str, list[list[tuple[int, float]]]] = {}
+            for policy in played:
+                losses.setdefault(label[policy.name], []).append(policy.losses)
+            plot_learning_curves(losses, fewest, out / f"learning_curves{suffix}.png", title=title)
         task = played[0].task()
         if not options.run.videos:
             continue

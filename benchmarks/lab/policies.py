@@ -99,8 +99,13 @@ class Policy:
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
 
     @property
+    def state(self) -> Path:
+        """Return the file from which its training continues; a finished policy does not need it."""
+        return self.folder / "state.safetensors"
+
+    @property
     def losses(self) -> list[tuple[int, float]]:
-        return load_state(self.folder / "state.safetensors")[1]["losses"]
+        return load_state(self.state)[1]["losses"]
 
     @property
     def seconds(self) -> float | None:

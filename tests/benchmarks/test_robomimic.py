@@ -47,6 +47,8 @@ def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypat
     assert "--resume" in refused(robomimic.main, options(dataset, out), capfd)
     assert (out / "results.jsonl").read_bytes() == before
     # A second run of the same options trains nothing again, and its rows are the same.
+    (state,) = out.parent.glob("policies/*-past-*/state.safetensors")
+    state.unlink()  # a finished policy does not need it
     times, second = written(out.parent / "policies"), tmp_path / "runs" / "second"
 
     def broken(*args, **options):
@@ -57,7 +59,8 @@ def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypat
         patch.setattr(pictures, "record_filmstrip", broken)
         assert robomimic.main(options(dataset, second, episodes=3, prior="past")) == 0
     printed = capfd.readouterr().out
-    assert "WP-Past: no renderer" in printed  # and the run is whole
+    assert "WP-Past: no renderer" in printed and str(state) in printed  # and the run is whole
+    assert is_png(second / "success.png") and not (second / "learning_curves.png").exists()
     assert "found lift ph, past" in printed and written(out.parent / "policies") == times
     assert stored(second) == [row for row in rows if row["prior"] == "past"]
 
