@@ -50,7 +50,7 @@ class AsyncExecutor:
     both return the same actions.
 
     The first step of an episode waits for its chunk. Later, if no action is left and no chunk arrives
-    within ``timeout`` seconds, :meth:`act` raises ``TimeoutError``: hold the robot, and call it again.
+    within ``timeout`` seconds, :meth:`act` raises ``TimeoutError``: hold the robot, and retry.
     Several threads can share an executor: their calls take turns.
 
     The normaliser, the number of stacked observations, and the observations' names and sizes come from the

@@ -32,7 +32,7 @@ class VelocityMLP(VelocityNetwork):
 
     The input of every block is scaled and shifted as a function of ``t`` (adaptive layer norm, Peebles and
     Xie, 2023, without their gate), initially without effect. So training at ``t = 0``, the only time that a
-    one-step sampler evaluates, interferes little with other times. Its observation encoder lowers the
+    one-step sampler evaluates, interferes little with other times. The observation encoder lowers the
     held-out error on robot tasks by 2 to 3 percent. Given data, wrap the network in a
     :class:`~warmprior.PreconditionedNetwork` fitted to them.
 

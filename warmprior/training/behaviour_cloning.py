@@ -54,7 +54,7 @@ class BehaviourCloning:
     folder continues it; on a CPU the result is bitwise equal to that of an uninterrupted run with the same
     number of threads.
 
-    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and executes
+    Processes in :func:`~warmprior.io.distributed.joined` train together: each constructs and executes
     the same run and draws its own part of every batch, PyTorch's DDP averages the gradients, and only the
     first process writes.
 

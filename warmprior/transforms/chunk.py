@@ -181,10 +181,10 @@ class ChunkStep(EnvTransform):
     stepped keep all observations.
 
     An environment without batch dimensions may take all but a chunk's first step in one call, which
-    doubles the speed of :class:`~warmprior.envs.RobosuiteEnv`. It needs a method
-    ``control_steps(actions, keep)``, defined in the class that defines ``_step``, which executes raw actions
-    ``[n, d_a]`` until the episode ends and returns one tensordict per step: the last ``keep`` complete, the
-    earlier ones with reward, flags and ``"success"`` only.
+    doubles the speed of :class:`~warmprior.envs.RobosuiteEnv`. The class
+    that defines ``_step`` must then define ``control_steps(actions, keep)``: it executes raw actions ``[n,
+    d_a]`` until the episode ends and returns one tensordict per step, the last ``keep`` complete, the earlier
+    ones with reward, flags and ``"success"`` only.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
