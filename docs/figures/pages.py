@@ -57,7 +57,7 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
             entries.append("")
             continue
         rate = f"{100 * outcomes.mean() + 1e-6:.0f}"
-        rate = f"**{rate}**" if outcomes.mean() == most else rate
+        rate = f"**{rate}**" if outcomes.mean() == most and len(solved) > 1 else rate
         if source != GAUSSIAN and gaussian is not None and len(outcomes) == len(gaussian):
             rate += f" ({(outcomes > gaussian).sum()} : {(outcomes < gaussian).sum()})"
         entries.append(rate)
