@@ -105,7 +105,7 @@ def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(pytho
     code, *_ = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     (tmp_path / "quickstart.py").write_text(code)
     printed = run(python, "quickstart.py", cwd=tmp_path)
-    assert [line.split(":")[0] for line in printed.splitlines()[:2]] == ["gaussian", "past"]
+    assert [line.split(",")[0] for line in printed.splitlines()[:6]] == ["gaussian"] * 3 + ["past"] * 3
     printed = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
     assert "PastPrior(chunk_length=4" in printed
     assert f"warmprior {PROJECT['version']}, format {FORMAT}" in printed
@@ -114,11 +114,11 @@ def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(pytho
 def test_a_simulated_policy_trains_and_plays_with_the_wheel_alone(python, tmp_path):
     pytest.importorskip("robosuite")
     write_robomimic_file(tmp_path / "lift.hdf5", lengths=(30, 40), task="lift")
-    words = "train --dataset lift.hdf5 --iterations 3 --batch-size 8 --checkpoints 1 --hidden-dim 16"
+    words = "train lift.hdf5 --iterations 3 --batch-size 8 --checkpoints 1 --hidden-dim 16"
     trained = run(python, "-m", "warmprior", *words.split(), cwd=tmp_path).splitlines()[-1]
     one = ["--episodes", "1", "--nfe", "1"]
     printed = run(python, "-m", "warmprior", "evaluate", trained, *one, cwd=tmp_path)
-    assert re.search(r"^[01] of 1 episodes solved", printed, re.M)
+    assert re.search(r"^NFE 1: [01] of 1 episodes solved", printed, re.M)
 
 
 WHERE = """
