@@ -11,7 +11,7 @@ from warmprior.__main__ import main
 from warmprior.training.saved import load_policy, save_policy
 
 pytest.importorskip("robosuite")
-from warmprior.envs import rendering_backend
+from warmprior.envs import TASKS, rendering_backend
 from warmprior.training import NetworkOptions, Task, TrainingConfig, play_episode, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 
@@ -55,6 +55,7 @@ def test_evaluate_plays_the_same_episodes(saved, capsys):
     assert main(["info", str(folder)]) == 0
     said = capsys.readouterr().out
     assert "PastPrior(chunk_length=8" in said and "Lift" in said and "VelocityMLP" in said
+    assert f"state ({TASKS['lift'].observation_dim},)" in said
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

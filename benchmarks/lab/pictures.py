@@ -40,12 +40,13 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         label = dict(zip(task_rows.policy, task_rows.method, strict=True))
         fewest = at_fewest(task_rows)
         fewest = fewest[fewest.temperature == fewest.groupby("method").temperature.transform("max")]
-        if removed := [str(policy.state) for policy in played if not policy.state.is_file()]:
-            print(f"No learning curves: {removed[0]} has been removed")
-        else:
-            losses: dict[str, list[list[tuple[int, float]]]] = {}
-            for policy in played:
+        losses: dict[str, list[list[tuple[int, float]]]] = {}
+        for policy in played:
+            if policy.state.is_file():
                 losses.setdefault(label[policy.name], []).append(policy.losses)
+            else:
+                print(f"No learning curve of {policy}: {policy.state} is missing")
+        if losses:
             plot_learning_curves(losses, fewest, out / f"learning_curves{suffix}.png", title=title)
         task = played[0].task()
         if not options.run.videos:

@@ -39,7 +39,8 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
         return None if encoder is None else encoder.shapes
     width = network.observation_dim
     if keys.CONDITIONED in actor.in_keys:
-        width -= HistoryObservation.width((prior or plain.prior).chunk_length, network.action_dim)
+        prior = plain.prior if prior is None else prior
+        width -= HistoryObservation.width(prior.chunk_length, network.action_dim)
     return {keys.STATE: (width,)}
 
 
