@@ -222,7 +222,7 @@ class StandsAtTheEnd(Transform):
 
 
 def play(policy, episodes=20):
-    """How many episodes end upright, and all observations ``[episodes, 201, 3]``."""
+    """Return how many episodes end upright, and all observations ``[episodes, 201, 3]``."""
     judge = StandsAtTheEnd()
     transforms = Compose(
         judge, policy_transforms(policy.prior, normalizer=normalizer)

@@ -2,7 +2,7 @@
 5. Policies that see images
 ===========================
 
-With cameras nothing changes but the observation: a vector beside images, nested under one key, and
+With cameras nothing changes but the observation: a vector next to images, nested under one key, and
 an encoder in front of the network. The task of this tutorial draws its own pictures, so that it
 runs without a simulator: a gripper, seen from above, has to reach a part whose position only the
 camera shows.

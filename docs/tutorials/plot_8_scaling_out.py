@@ -51,7 +51,7 @@ for row in rows:
 # %%
 # Nothing is trained twice
 # ------------------------
-# A policy lies in a folder named by everything that determines it, in ``policies/`` beside the
+# A policy lies in a folder named by everything that determines it, in ``policies/`` next to the
 # runs. A run with a third seed finds the other four policies there, and trains two.
 
 policies = Path(folder.name) / "grid" / "policies"
@@ -81,7 +81,7 @@ for row in alone:
         for place in places
     )
     pairs = zip(one.parameters(), other.parameters(), strict=True)
-    equal = all(torch.equal(mine, theirs) for mine, theirs in pairs)
+    equal = all(torch.equal(first, second) for first, second in pairs)
     print(row["prior"], "has the same weights:", equal)
 
 # %%

@@ -111,7 +111,7 @@ class _Average(AveragedModel):
             cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
             torch._foreach_copy_(averages, weights)
-        for mine, trained in owners:  # a forward pass may replace a buffer
-            for averaged, buffer in zip(mine.buffers(False), trained.buffers(False), strict=True):
+        for own, trained in owners:  # a forward pass may replace a buffer
+            for averaged, buffer in zip(own.buffers(False), trained.buffers(False), strict=True):
                 averaged.copy_(buffer)
         self.n_averaged += 1
