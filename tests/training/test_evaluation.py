@@ -33,7 +33,7 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.io.workers import WorkerError
-from warmprior.training import Episode, evaluate, parallel_env, play_episode
+from warmprior.training import Episode, Task, evaluate, parallel_env, play_episode
 from warmprior.training.parallel import watched
 
 H = 3
@@ -364,3 +364,11 @@ def test_policy_and_environment_need_one_normaliser():
     for wrong in (None, other):
         with raises(ValueError, "normalizer=policy.normalizer"):
             play(wrong)
+
+
+@pytest.mark.parametrize("given", [{"success": "solved"}, {"measures": {"reward": "sum"}}])
+def test_a_task_has_its_own_success_and_measures(given):
+    rows = TensorDict({"observation": torch.rand(9, 1), "action": torch.rand(9, ACTION_DIM)}, [9])
+    task = Task.of("own", rows.set("episode", torch.zeros(9, dtype=torch.int64)), CountingEnv)
+    with raises(ValueError, next(iter(given))):
+        evaluate(mlp_actor(PastPrior(4)), task, episodes=1, first_seed=0, **given)

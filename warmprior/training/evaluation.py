@@ -213,7 +213,8 @@ def evaluate(
 
     Raises:
         ValueError: if ``episodes < 1``; if the environment has several batch dimensions, cannot play given
-            seeds in its rows, or adds an offset to them; or if it lacks the policy's normaliser.
+            seeds in its rows, or adds an offset to them; if it lacks the policy's normaliser; or if
+            ``success`` or ``measures`` are given with a :class:`Task`.
         KeyError: see :func:`play_episode`.
         WorkerError: a ``RuntimeError``, if a worker process dies.
 
@@ -233,6 +234,8 @@ def evaluate(
         [100, 101, 102, 103, 104, 105]
     """
     if isinstance(env, Task):
+        if success != keys.SUCCESS or measures is not None:
+            raise ValueError("a Task has its own success and measures: give them to the Task instead")
         success, measures = env.success, env.measures
         env = env.env(policy)  # type: ignore[arg-type]
     check_whole_numbers(episodes=episodes)
