@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.errors import raises
 from tests.objectives.test_flow_matching import actor_for, loss_of, sample
 from warmprior import FlowMatchingLoss, PastPrior
 from warmprior.objectives.times import TIMES
@@ -62,3 +63,13 @@ def test_the_loss_is_given_them():
     counted = ~data["action_is_pad"]
     expected = (predicted - (a1 - a0)).square()[counted].mean()
     torch.testing.assert_close(loss(data)["loss_flow_matching"], expected)
+
+
+def test_a_coupling_with_times_takes_no_others():
+    def in_order(a0, a1, observation):
+        return a0, a1
+
+    in_order.times = TIMES["start"]
+    with raises(ValueError, "u-shaped"):
+        FlowMatchingLoss(actor_for(PastPrior(4)), coupling=in_order, times="u-shaped")
+    assert FlowMatchingLoss(actor_for(PastPrior(4)), coupling=in_order).times is TIMES["start"]

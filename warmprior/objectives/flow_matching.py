@@ -45,8 +45,8 @@ class FlowMatchingLoss(LossModule):
         coupling: a function that pairs the sources and targets of a batch, see :data:`~warmprior.Coupling`;
             by default they are paired in order (Algorithm 1).
         times: the distribution of training times: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`. A
-            coupling's own times take precedence.
+            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`;
+            not with a coupling that has times of its own.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) leaves errors unchanged. ``"standardised"`` divides them by
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that all
@@ -124,6 +124,8 @@ class FlowMatchingLoss(LossModule):
         self.actor_network = actor_network
         self.coupling, self.objective, self.reduction = coupling, objective, reduction
         own = getattr(coupling, "times", None)  # a coupling may come with times, and a path, of its own
+        if own is not None and times != "uniform":
+            raise ValueError(f"{type(coupling).__name__} has its own times: leave out times={times!r}")
         self.times = own or (times if callable(times) else chosen_times(times))
         if times == "start" and (sampling.max_nfe != 1 or actor_network.ode.start_time > 0):
             raise ValueError(
