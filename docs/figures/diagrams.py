@@ -8,7 +8,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from shared import DOCS, SVG
+from shared import DOCS, INK, SVG
 
 OUT = DOCS / "_static"
 GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
@@ -33,7 +33,7 @@ def box(
 ) -> None:
     """Draw a rectangle with its text, centred at a place."""
     (x, y), (width, height) = place, size
-    colors = {"fc": style.get("fc", "white"), "ec": style.get("ec", "0.3")}
+    colors = {"fc": style.get("fc", "white"), "ec": style.get("ec", INK)}
     axis.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, lw=1.2, **colors))
     axis.text(x, y, text, ha="center", va="center", fontsize=10.5, color=style.get("color", "black"))
 
@@ -46,7 +46,7 @@ def flowchart() -> None:
         y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
         box(axis, (right, y), (23, 6.4), answer, fc=color, ec=color, color="white")
-        arrow = {"arrowstyle": "-|>", "color": "0.3"}
+        arrow = {"arrowstyle": "-|>", "color": INK}
         axis.annotate("", (right - 11.5, y), (left + 15, y), arrowprops=arrow)
         axis.annotate("", (left, y - step + 3.2), (left, y - 3.2), arrowprops=arrow)
         axis.text(left + 16, y + 0.6, "yes", fontsize=10)
@@ -76,10 +76,10 @@ def timeline() -> None:
     for name, row in rows.items():
         axis.text(0.5, row, name, va="center", fontsize=10.5)
     for step in range(0, 25, 8):
-        axis.text(start + unit * step, 36.4, str(step), ha="center", fontsize=10, color="0.3")
-        axis.plot([start + unit * step] * 2, [3.5, 35.6], color="0.85", zorder=0)
-    axis.text(0.8, 36.4, "control step", fontsize=10, color="0.3")
-    axis.plot([start + unit * 8] * 2, [3.5, 35.6], color="0.3", ls="--")
+        axis.text(start + unit * step, 36.4, str(step), ha="center", fontsize=10, color=INK)
+        axis.plot([start + unit * step] * 2, [3.5, 35.6], color=INK, alpha=0.3, zorder=0)
+    axis.text(0.8, 36.4, "control step", fontsize=10, color=INK)
+    axis.plot([start + unit * 8] * 2, [3.5, 35.6], color=INK, ls="--")
     axis.text(start + unit * 8, 1.0, "decision", ha="center", fontsize=10)
     bar(31, 0, 8, "chunk A", fc=LIGHT)
     bar(31, 8, 16, "chunk B,\nto decide", fc="white")

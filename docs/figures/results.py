@@ -20,6 +20,7 @@ from shared import (
     CORRELATED,
     DOCS,
     GAUSSIAN,
+    INK,
     OPERATORS,
     OUT,
     PAST,
@@ -83,12 +84,12 @@ def one_step() -> None:
         )
     for k, name in enumerate(order):
         if name.startswith("mean"):
-            axis.axhspan(k - 0.5, k + 0.5, color="0.94", zorder=0)
+            axis.axhspan(k - 0.5, k + 0.5, color=INK, alpha=0.12, lw=0, zorder=0)
     axis.axvline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
     axis.set_yticks(range(len(order)), order)
     axis.set_ylim(len(order) - 0.5, -0.5)
-    axis.set_xlabel("difference in points, with its 95% interval")
-    axis.grid(axis="x", color="0.9")
+    axis.set_xlabel("points, with 95% interval")
+    axis.grid(axis="x")
     save(picture, "one_step")
 
 
@@ -184,7 +185,7 @@ def noise() -> None:
             white, common = group[group["correlation"] == 0], group[group["correlation"] > 0]
             axis.plot(white["kept"], white["gain"], "o-", color=color, label=label)
             axis.plot(common["kept"], common["gain"], "s", ms=8, mfc="none", mew=2, color=color)
-        axis.plot([], [], "s", ms=8, mfc="none", mew=2, color="0.3", label="correlated noise")
+        axis.plot([], [], "s", ms=8, mfc="none", mew=2, color=INK, label="correlated noise")
         axis.axhline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
         finish(axis, name, xlabel="noise that averaging over a chunk leaves", xlim=(0, None))
         axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)

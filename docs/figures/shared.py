@@ -10,6 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, read_csv, read_json
 
+INK = "#767676"  # text and lines, which a white and a black page show equally well
+matplotlib.rcParams |= {"savefig.transparent": True, "grid.color": INK, "grid.alpha": 0.3}
+matplotlib.rcParams |= {
+    f"{part}color": INK for part in ("text.", "axes.label", "axes.edge", "xtick.", "ytick.")
+}
 matplotlib.rcParams["svg.hashsalt"] = "warmprior"  # reproducible files
 SVG = {"metadata": {"Date": None}}
 
@@ -24,14 +29,14 @@ SOURCES = {  # label, colour and marker in charts
     CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
     WIDE: ("WP-Past, sigma = 1", "#984ea3", "o"),
     "preview,correlation=0.5": ("WP-Preview, correlated noise", "#e6ab02", "o"),
-    "ot": ("OT-CFM", "0.2", "s"),
-    "cvae": ("learned, autoencoder", "0.2", "^"),
-    "leap": ("learned, from the observation", "0.2", "v"),
-    "step,start_time=0.5": ("STEP", "0.2", "D"),
-    "history": ("history conditioning", "0.2", "P"),
-    "a2a": ("learned, from the last actions", "0.2", "X"),
-    "forecast": ("learned, from both", "0.2", "*"),
-    "regression": ("regression", "0.2", "p"),
+    "ot": ("OT-CFM", INK, "s"),
+    "cvae": ("learned, autoencoder", INK, "^"),
+    "leap": ("learned, from the observation", INK, "v"),
+    "step,start_time=0.5": ("STEP", INK, "D"),
+    "history": ("history conditioning", INK, "P"),
+    "a2a": ("learned, from the last actions", INK, "X"),
+    "forecast": ("learned, from both", INK, "*"),
+    "regression": ("regression", INK, "p"),
     "mip": ("MIP", "#a6761d", "s"),
     "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
     "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
@@ -85,7 +90,7 @@ def finish(axis: Axes, title: str, **settings: object) -> None:
     """Set title, labels and a faint grid."""
     axis.set_title(title, fontsize=10.5)
     axis.set(**settings)
-    axis.grid(axis="y", color="0.9")
+    axis.grid(axis="y")
 
 
 def shown_sources(rows: DataFrame) -> list[str]:
