@@ -1,7 +1,6 @@
-"""The programs of the pages run as they stand; what needs something of the reader's says so."""
+"""The programs of the pages run as they stand; test_given_blocks.py has those that need something."""
 
 import importlib
-import json
 import re
 import subprocess
 import sys
@@ -51,16 +50,6 @@ def test_a_program_runs(files, text):
 @pytest.mark.parametrize("text", PROGRAMS)
 def test_a_program_runs_in_a_fresh_process(files, text):
     subprocess.run([sys.executable, "-c", text], check=True)
-
-
-@pytest.mark.parametrize("text", [pytest.param(text, id=name) for name, text in BLOCKS])
-def test_names_are_defined_or_said_to_be_given(text):
-    words = "-m ruff check --isolated --select=F821 --output-format=json -"
-    check = [sys.executable, *words.split()]
-    found = json.loads(subprocess.run(check, input=text, capture_output=True, text=True).stdout)
-    undefined = {re.search("`(.*?)`", each["message"])[1] for each in found}
-    given = GIVEN.match(text)
-    assert undefined == (set(given[1].split(", ")) if given else set())
 
 
 COMMAND = re.compile(r"^(?:torchrun [^\n]*? )?(?:python )?(-m warmprior|benchmarks/\w+\.py)(.*)$", re.M)

@@ -27,10 +27,13 @@ def scene(episode, step, side=32):
     return image
 
 
-def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), **options):
+def write_lerobot(
+    root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), same=(), **options
+):
     """Write random episodes with LeRobot, and return the values of all steps by feature.
 
-    The last number of features that are resting never changes.
+    The last number of features that are resting never changes. Those that are the same have the values of the
+    feature before them.
     """
     from lerobot.datasets import LeRobotDataset
 
@@ -52,8 +55,8 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
                 value = rng.normal(size=feature["shape"])
                 value = value > 0 if feature["dtype"] == "bool" else value.astype(feature["dtype"])
                 value[-1] = 0.5 if name in resting else value[-1]
-                frame[name] = value
-                written[name].append(value)
+                frame[name] = list(frame.values())[-1] if name in same else value
+                written[name].append(frame[name])
             frame |= {name: scene(episode, step) for name in cameras}
             dataset.add_frame(frame | {"task": "lift"})
         with quietly():

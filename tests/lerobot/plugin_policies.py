@@ -5,6 +5,8 @@ from functools import partial
 import torch
 
 from tests.lerobot.tiny import (
+    STATE,
+    features,
     make_groot,
     make_pi,
     make_smolvla,
@@ -12,6 +14,7 @@ from tests.lerobot.tiny import (
     tiny_groot,
     tiny_smolvlm,
 )
+from tests.toy_env import stirred
 
 VLA = ["warm_smolvla", "warm_pi05", "warm_groot"]
 
@@ -50,6 +53,34 @@ def flow_policy(found, images=None, **options):
     kind, features = found["warm_flow"], {"input_features": inputs, "output_features": outputs}
     torch.manual_seed(0)
     return kind(kind.config_class(**features, **chosen | options))
+
+
+STATS = {
+    "observation.state": {"min": [-2.0] * STATE, "max": [4.0] * (STATE - 1) + [-2.0]},
+    "action": {"min": [-3.0, -3.0], "max": [7.0, -3.0]},
+}
+"""The last dimension of both never changes."""
+
+
+def saved_flow_policy(found, folder, image=None):
+    """A policy with two actions and its processors, saved as a training run saves them."""
+    from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
+
+    kind, named = found["warm_flow"], features(image)
+    named["output_features"]["action"].shape = (2,)
+    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
+    config = kind.config_class(precondition=False, image_size=32, crop_size=28, **small, **named)
+    torch.manual_seed(0)
+    policy = kind(config)
+    stirred(policy.actor.network, by=0.05)
+    policy.update()
+    stirred(policy.actor.network, by=0.5)
+    policy.save_pretrained(folder)
+    stats = {name: {end: torch.tensor(v) for end, v in of.items()} for name, of in STATS.items()}
+    pipelines = make_warm_flow_pre_post_processors(config, stats)
+    for pipeline in pipelines:
+        pipeline.save_pretrained(folder)
+    return policy, *pipelines
 
 
 def one_observation():

@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.lerobot.plugin_policies import warm
+from tests.lerobot.plugin_policies import saved_flow_policy, warm
 from tests.lerobot.test_actor import preprocessed
-from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE, features
-from tests.toy_env import stirred
+from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
 from warmprior import PastPrior, RealTimeChunking
 from warmprior.deploy import AsyncExecutor
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
@@ -69,33 +68,12 @@ def test_an_adapter_brings_policy_and_prior(policy):
         LeRobotActor(guided)
 
 
-STATS = {
-    "observation.state": {"min": np.full(STATE, -2.0), "max": np.array([4.0] * (STATE - 1) + [-2.0])},
-    "action": {"min": np.full(2, -3.0), "max": np.array([7.0, -3.0])},
-}
-"""The last dimension of both never changes."""
-
-
 @pytest.mark.parametrize("camera", [False, True])
 def test_a_warm_flow_policy_acts_by_its_averaged_weights(found, tmp_path, camera):
-    from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
     from lerobot_policy_warmprior.robot import load_actor
 
-    kind, side = found["warm_flow"], 32
-    named = features((3, side, side) if camera else None)
-    named["output_features"]["action"].shape = (2,)
-    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
-    config = kind.config_class(precondition=False, image_size=side, crop_size=28, **small, **named)
-    torch.manual_seed(0)
-    policy = kind(config)
-    stirred(policy.actor.network, by=0.05)
-    policy.update()
-    stirred(policy.actor.network, by=0.5)
-    policy.save_pretrained(tmp_path)
-    stats = {name: {end: torch.tensor(v).float() for end, v in of.items()} for name, of in STATS.items()}
-    before, after = make_warm_flow_pre_post_processors(config, stats)
-    for pipeline in (before, after):
-        pipeline.save_pretrained(tmp_path)
+    side = 32
+    policy, before, after = saved_flow_policy(found, tmp_path, (3, side, side) if camera else None)
     seen, expected = list(observations(12, side)), []
     torch.manual_seed(1)
     policy.reset()
