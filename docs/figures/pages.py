@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from pandas import DataFrame
 from shared import GAUSSIAN, SOURCES, read_played, shown_sources
 
 from lab.statistics import chosen_elsewhere
@@ -30,22 +31,30 @@ def played_table(name: str) -> str:
     text = ["| NFE | noise | " + " | ".join(SOURCES[source][0] for source in names) + " |"]
     text.append("|---" * (2 + len(names)) + "|")
     for nfe, part in rows.sort_values(["nfe", "noise"], ascending=False).groupby("nfe", sort=False):
-        solved = {
-            (noise, source): np.concatenate(list(group.sort_values("seed")["solved"]))
-            for (noise, source), group in part.groupby(["noise", "source"], sort=False)
-        }
-        noises = list(dict.fromkeys(noise for noise, _ in solved))
-        text += [
-            _played_line(nfe, f"{n:g}", {s: solved[n, s] for s in names if (n, s) in solved}, names)
-            for n in noises
-        ]
-        if len(noises) > 1:
-            every = {s: [solved[n, s] for n in noises if (n, s) in solved] for s in names}
-            full = {s: e for s, e in every.items() if len(e) == len(noises) and len({*map(len, e)}) == 1}
-            if full:
-                best = {s: chosen_elsewhere(np.stack(outcomes)) for s, outcomes in full.items()}
-                text.append(_played_line(nfe, "own best", best, names))
+        solved = _solved(part)
+        text += [_played_line(nfe, f"{noise:g}", by_source, names) for noise, by_source in solved.items()]
+        if best := own_best(part):
+            text.append(_played_line(nfe, "own best", best, names))
     return "\n".join(text) + "\n"
+
+
+def _solved(rows: DataFrame) -> dict[float, dict[str, np.ndarray]]:
+    """Return the outcomes of the episodes of all seeds, by factor of the noise and source."""
+    solved: dict[float, dict[str, np.ndarray]] = {}
+    for (noise, source), group in rows.groupby(["noise", "source"], sort=False):
+        outcomes = np.concatenate(list(group.sort_values("seed")["solved"]))
+        solved.setdefault(noise, {})[source] = outcomes
+    return solved
+
+
+def own_best(rows: DataFrame) -> dict[str, np.ndarray]:
+    """Return the outcomes of each source with its best noise, for sources that played the same with each."""
+    solved = _solved(rows)
+    if len(solved) < 2:
+        return {}
+    every = {s: [of[s] for of in solved.values() if s in of] for s in shown_sources(rows)}
+    full = {s: e for s, e in every.items() if len(e) == len(solved) and len({*map(len, e)}) == 1}
+    return {source: chosen_elsewhere(np.stack(outcomes)) for source, outcomes in full.items()}
 
 
 def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: list[str]) -> str:

@@ -1,0 +1,125 @@
+"""The sentences of pages whose numbers come from rows, as the rows say them.
+
+The tests look for each in its page. A sentence that is not there has older numbers, or other words.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from leaderboard import DOOR, standings
+from pages import own_best
+from pandas import DataFrame
+from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read, read_played
+
+WARM = (PAST, PREVIEW, CORRELATED)
+TEN, TWENTY_FIVE = "10: square, can and stack", "25: square, can and stack"
+
+
+def whole(number: float) -> int:
+    """Return the number as tables round it."""
+    return int(f"{number + 1e-6:.0f}")
+
+
+def span(numbers: list[float]) -> str:
+    """Return ``lowest to highest``."""
+    rounded = sorted(map(whole, numbers))
+    return f"{rounded[0]} to {rounded[-1]}"
+
+
+def played(run: str, source: str, nfe: int, noise: float = 1.0) -> DataFrame:
+    """Return the rows of a source in a run."""
+    rows = read_played(run)
+    return rows[(rows["source"] == source) & (rows["nfe"] == nfe) & (rows["noise"] == noise)]
+
+
+def solved(run: str, source: str, nfe: int, noise: float = 1.0) -> float:
+    """Return the success of a source in percent, over all seeds."""
+    return 100 * np.concatenate(list(played(run, source, nfe, noise)["solved"])).mean()
+
+
+def pair(run: str, source: str) -> str:
+    """Return the episodes won and lost against the Gaussian source, over all NFE."""
+    won = lost = 0
+    for nfe in 9, 3, 1:
+        both = [played(run, name, nfe).set_index("seed")["solved"] for name in (source, GAUSSIAN)]
+        for outcomes, base in zip(*both, strict=True):
+            won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
+    return f"{won} : {lost}"
+
+
+def scripted(name: str, source: str, nfe: int = 1) -> float:
+    """Return the mean success on scripted demonstrations."""
+    rows = read("means")
+    return rows[(rows["setting"] == name) & (rows["source"] == source) & (rows["nfe"] == nfe)][
+        "success"
+    ].item()
+
+
+def pusht(count: int, source: str, nfe: int) -> float:
+    """Return the success on Push-T."""
+    rows = read("pusht")
+    rows = rows[(rows["demonstrations"] == count) & (rows["source"] == source) & (rows["nfe"] == nfe)]
+    return rows["success"].item()
+
+
+def sentences() -> dict[str, list[str]]:
+    """Return the sentences of each page."""
+    board = standings().set_index(["source", "nfe"])
+    few = [
+        scripted(name, source) - scripted(name, GAUSSIAN)
+        for name in (TEN, TWENTY_FIVE)
+        for source in (PAST, PREVIEW)
+    ]
+    many = "150 or 300: all eight settings"
+    longer = {
+        nfe: [solved("square_mh_80000", s, nfe) - solved("square_mh_80000", GAUSSIAN, nfe) for s in WARM]
+        for nfe in (9, 1)
+    }
+    nine, one = ({s: whole(solved("square_mh_80000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 1))
+    door = {nfe: {s: whole(solved("door_20000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 3, 1)}
+    rows = read_played("door_20000")
+    best = {
+        nfe: {s: whole(100 * outcomes.mean()) for s, outcomes in own_best(rows[rows["nfe"] == nfe]).items()}
+        for nfe in (9, 1)
+    }
+    loss = [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in (GAUSSIAN, *WARM)]
+    few_longer = [f"{whole(pusht(50, s, 9))}" for s in (PAST, CORRELATED, GAUSSIAN)]
+    noise = read("noise")
+    noise = noise[(noise["style"] == "mh") & (noise["task"] == "square") & (noise["source"] == PAST)]
+    noise = noise[(noise["seeds"] == 1) & (noise["actions"] == "deltas")].set_index("sigma")["success"]
+    at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
+    mip = board.loc["mip", 2]
+    return {
+        "../README.md": [
+            f"({whole(mip['mean'])}% on average)",
+            f"WP-Past and WP-Preview succeed {span(few)} points more often",
+            f"succeeds {whole(scripted(many, CORRELATED) - scripted(many, GAUSSIAN))} points more often",
+            f"succeed {span(longer[9])} points more often at nine steps and "
+            f"{span([-n for n in longer[1]])} less often at one",
+        ],
+        "which_source.md": [
+            f"succeeds in {door[3][GAUSSIAN]}% of the episodes "
+            f"and correlated noise in {door[3][CORRELATED]}%",
+            f"WP-Past and WP-Preview succeed {span(few)} points more often",
+            f"the Gaussian source solves {whole(pusht(206, GAUSSIAN, 9))}% at nine steps, "
+            f"and warm sources {span([pusht(206, s, 9) for s in WARM])}%",
+            f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (one seed)",
+            f"lead with {few_longer[0]} and {few_longer[1]}%, against the Gaussian source's {few_longer[2]}",
+            f"solves {whole(mip['Push-T, 206'])}% with 206",
+            f"all warm sources succeed {span(longer[9])} points more",
+            f"at one step sources solve {span(loss)}% fewer episodes than at nine",
+        ],
+        "leaderboard.md": [
+            f"({best[9][GAUSSIAN]}%; WP-Past and WP-Preview {best[9][PAST]})",
+            f"correlated noise solves {best[1][CORRELATED]}% and the Gaussian source {best[1][GAUSSIAN]}",
+            f"({whole(mip[DOOR])} against {max(n for at in door.values() for n in at.values())}%)",
+            f"({pair('door_80000', CORRELATED)} over all steps)",
+            f"with 206 ({pair('pusht_206_80000', PAST)})",
+        ],
+        "results.md": [
+            f"at nine the Gaussian source solves {nine[GAUSSIAN]}%, WP-Past {nine[PAST]}, "
+            f"WP-Preview and correlated noise {nine[PREVIEW]}; at one step they solve {one[GAUSSIAN]}, "
+            f"{one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
+        ],
+        "faq.md": [f"({whole(noise[0.25])}% at 0.25, {whole(noise[0.1])}% at 0.1)"],
+    }
