@@ -68,10 +68,10 @@ def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = Fal
 
 
 def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
-    """Return the colour of each method: its prior's, in shades if several methods share a prior."""
+    """Return the colour of each method: its prior's, in paler shades for methods with options."""
     colors: dict[Hashable, Any] = {}
     for prior, group in rows.groupby("prior", sort=False):
-        base, methods = to_rgb(color(prior)), group["method"].unique()
+        base, methods = to_rgb(color(prior)), sorted(group["method"].unique(), key=lambda name: "," in name)
         end = float(sum(base) < 2)
         for place, method in enumerate(methods):
             share = PALEST * place / max(1, len(methods) - 1)

@@ -256,7 +256,7 @@ def test_the_actor_knows_the_sigma_of_its_source():
     torch.testing.assert_close(found["vla_action", "chunk"], a)
 
 
-def test_missing_keys_and_agents():
+def test_missing_keys_and_decoders():
     data = decision(PastPrior(4), 2).exclude("rtc")
     with raises(KeyError, "InferenceDelay", "AsyncExecutor"):
         actor(PastPrior(4), guidance=RealTimeChunking())(data)

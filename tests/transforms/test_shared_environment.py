@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
@@ -16,7 +16,6 @@ from warmprior import (
     InferenceDelay,
     ObservationStack,
     PastPrior,
-    PreviewPrior,
     PriorAnchor,
     PriorDecoder,
     policy_transforms,
@@ -126,64 +125,11 @@ def test_an_action_that_nobody_chooses_is_refused(keys):
         ChunkStep(H, action_keys=keys, chunk_keys=[])
 
 
-class Team(EnvBase):
-    """A group of three agents, whose actions are counted together."""
-
-    def __init__(self, batch_size=()):
-        super().__init__(batch_size=batch_size)
-        b = self.batch_size
-        agents = Composite(observation=Unbounded((*b, 3, 4)), shape=(*b, 3))
-        self.observation_spec = Composite(agents=agents, shape=b)
-        action = Composite(action=Bounded(-9, 9, (*b, 3, 2)), shape=(*b, 3))
-        self.action_spec = Composite(agents=action, shape=b)
-        self.reward_spec = Unbounded((*b, 1))
-        self.done_spec = Categorical(2, dtype=torch.bool, shape=(*b, 1))
-
-    def _state(self):
-        agents = TensorDict({"observation": self.seen}, (*self.batch_size, 3))
-        return TensorDict({"agents": agents, "done": self.count >= LENGTH}, self.batch_size)
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.count = torch.zeros(*self.batch_size, 1)
-        self.seen = torch.zeros(*self.batch_size, 3, 4)
-        return self._state()
-
-    def _step(self, tensordict):
-        self.count = self.count + 1
-        self.seen = tensordict["agents", "action"].repeat_interleave(2, -1)
-        out = self._state().set("reward", tensordict["agents", "action"].sum((-1, -2)).unsqueeze(-1))
-        return out.set("terminated", out["done"])
-
-    def _set_seed(self, seed):
-        pass
-
-
-def test_the_agents_of_a_group_share_a_policy_and_have_histories_of_their_own():
-    policy = actor(PreviewPrior(H), 2, "agents", "observation")
-    transforms = policy_transforms(policy, action_key=("agents", "action"))
-    env = TransformedEnv(SerialEnv(2, Team), transforms)
-    check_env_specs(TransformedEnv(Team((2,)), policy_transforms(policy, action_key=("agents", "action"))))
-    with raises(ValueError, "agents"):
-        late = policy_transforms(policy, action_key=("agents", "action"), delay=1)
-        TransformedEnv(Team(), late).rollout(1)
-    rollout = env.rollout(10, policy)
-    assert rollout["agents", "chunk"].shape == (2, 3, 3, 2 * H, 2)
-    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
-    assert rollout["agents", "history"].batch_size == (2, 3, 3)
-    chunk, loc = rollout["agents", "chunk"], rollout["agents", "source", "loc"]
-    assert torch.equal(loc[:, 1:, :, :H], chunk[:, :-1, :, H:])
-    assert torch.equal(rollout["agents", "history", "actions"][:, 1:], chunk[:, :-1, :, :H])
-    returns = chunk[..., :H, :].sum((-1, -3)).cumsum(-1)
-    torch.testing.assert_close(rollout["next", "reward"][:, :2, 0], returns[:, :2, -1])
-
-
-def test_a_group_may_live_inside_of_workers():
-    def make_env():
-        return TransformedEnv(Team(), ChunkStep(H, action_keys=[("agents", "action")], chunk_keys=[CHUNK]))
-
-    rollout = SerialEnv(2, make_env).rollout(9)
-    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
-    assert rollout[CHUNK].shape == (2, 3, 3, H, 2)
+def test_a_group_of_agents_is_refused():
+    env = CountingEnv(LENGTH)
+    env.action_spec = Composite(agents=Composite(action=Unbounded((3, 2))))
+    with raises(ValueError, "(3, 2)", "agents"):
+        TransformedEnv(env, ChunkStep(H, action_keys=[("agents", "action")])).rollout(1)
 
 
 def test_one_key_of_an_environment_works_as_before():

@@ -201,10 +201,9 @@ class ChunkStep(EnvTransform):
             ignored if the environment does not write it.
         measures: further keys, each with ``"max"``, ``"sum"`` or ``"last"``: how its values over the executed
             steps become one per chunk.
-        action_keys: keys of the environment's actions, vectors ``[*B, d_a]``, or ``[*B, n, d_a]`` for the
-            ``n`` agents of a group.
-        chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]`` or ``[*B, n, P, d_a]``. Policies or
-            agents that act in the same environment need different keys.
+        action_keys: keys of the environment's actions, vectors ``[*B, d_a]``.
+        chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]``. Policies that act in the same
+            environment need different keys.
 
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
@@ -318,7 +317,7 @@ class ChunkStep(EnvTransform):
         if tuple(done) != (*batch, 1):
             raise RuntimeError(
                 f"ChunkStep needs one end per row, 'done' of shape {[*batch, 1]}, but the environment has "
-                f"{list(done)}: reduce it, or nest the agents' flags under a key"
+                f"{list(done)}: reduce it"
             )
         uneven = [
             k for k, leaf in base.observation_spec.items(True, True) if -1 in getattr(leaf, "shape", ())
@@ -431,18 +430,17 @@ class ChunkStep(EnvTransform):
             )
         for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             leaf = actions[action_key]
-            if leaf.ndim <= input_spec.ndim:
+            if leaf.ndim != input_spec.ndim + 1:
                 raise ValueError(
                     f"ChunkStep takes actions that are vectors [*B, d_a], but {action_key!r} has shape "
                     f"{tuple(leaf.shape)} for the batch size {tuple(input_spec.shape)}: make it a vector "
-                    "before, for instance with UnsqueezeTransform"
+                    "before, a number with UnsqueezeTransform. Groups of agents are not supported"
                 )
-            *agents, width = leaf.shape
-            # First, so that the branch of a group keeps its shape.
-            actions[chunk_key] = leaf.unsqueeze(-2).expand(*agents, self.prediction_length, width).clone()
+            *batch, width = leaf.shape
+            actions[chunk_key] = leaf.unsqueeze(-2).expand(*batch, self.prediction_length, width).clone()
             del actions[action_key]
             if isinstance(action_key, tuple) and actions[action_key[0]].is_empty():
-                del actions[action_key[0]]  # an empty group would count as an action
+                del actions[action_key[0]]  # an empty branch would count as an action
         return input_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

@@ -140,8 +140,6 @@ class InferenceDelay(EnvTransform):
         (forecast,) = self.in_keys
         check_keys(observation_spec, [forecast], "InferenceDelay", ": append it after ActionHistory")
         check_unwritten(observation_spec, self.out_keys, "InferenceDelay")
-        if observation_spec[forecast].ndim > observation_spec.ndim + 2:
-            raise ValueError("InferenceDelay and guidance do not support groups of agents: leave them out")
         check_delay(self.delay, self.execute, observation_spec[forecast].shape[-2])
         observation_spec[keys.DELAY] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device

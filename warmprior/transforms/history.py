@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
@@ -73,8 +73,6 @@ class ActionHistory(EnvTransform):
             raise KeyError(
                 f"ActionHistory found no {keys.EXECUTED!r} after the step: append it after ChunkStep"
             )
-        if history.ndim > next_tensordict.ndim:  # agents of a group, which execute equally many steps
-            executed = expand_as_right(executed.squeeze(-1), history["steps"])
         moved = advance(history, tensordict.get(self.in_keys[0]), executed)
         next_tensordict.set(self.history_key, moved)
         # Rows that were not stepped have executed nothing.
@@ -96,10 +94,9 @@ class ActionHistory(EnvTransform):
         return observation_spec
 
     def _cold(self, chunk: TensorSpec, place: TensorDictBase | TensorSpec) -> TensorDictBase:
-        agents = chunk.shape[len(place.shape) : -2]  # of a group, where there is one
         dtype = chunk.dtype if chunk.dtype.is_floating_point else torch.get_default_dtype()
         lengths, like = (self.history_length, *chunk.shape[-2:]), {"dtype": dtype, "device": place.device}
-        return cold_history((*place.shape, *agents), *lengths, **like)
+        return cold_history(place.shape, *lengths, **like)
 
     def _check_chunk(self) -> TensorSpec:
         actions = self.parent.full_action_spec

@@ -61,7 +61,7 @@ class ObservationStack(EnvTransform):
         return stack
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        time = self._time(next_tensordict)
+        time = next_tensordict.ndim
         newest = next_tensordict.get(self.observation_key)
         rows = tensordict.get("_step", None)
         if self.steps == 1 and rows is None:
@@ -79,7 +79,7 @@ class ObservationStack(EnvTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._check_key(tensordict_reset)
-        time = self._time(tensordict_reset)
+        time = tensordict_reset.ndim
         # Rows that were not reset keep their stack, because TorchRL merges only the others.
         stack = _each(
             lambda first: torch.stack([first] * self.steps, dim=time),
@@ -89,15 +89,9 @@ class ObservationStack(EnvTransform):
 
     def _as_reset(self, stepped: TensorDictBase) -> TensorDictBase:
         # The step has appended the new episode's first observation to the stack of the old one.
-        time = self._time(stepped)
+        time = stepped.ndim
         newest = _each(lambda stack: stack.select(time, -1), stepped.get(self.observation_key))
         return stepped.set(self.observation_key, newest)
-
-    def _time(self, place: TensorDictBase | Composite) -> int:
-        """Return the index of the stack's dimension, after those of the batch and of a group's agents."""
-        if isinstance(self.observation_key, tuple):
-            place = place[unravel_key(self.observation_key[:-1])]
-        return place.ndim
 
     def _check_key(self, observations: TensorDictBase | Composite) -> None:
         if self.observation_key not in observations.keys(True):
@@ -109,7 +103,7 @@ class ObservationStack(EnvTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Insert the stack's dimension after those of the batch."""
         self._check_key(observation_spec)
-        time = self._time(observation_spec)
+        time = observation_spec.ndim
         spec = observation_spec[self.observation_key]
         leaves = spec.items(True, True) if isinstance(spec, Composite) else [((), spec)]
         for key, leaf in list(leaves):
