@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 import warmprior
-from warmprior.history import window_history
 
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
@@ -132,17 +130,6 @@ def test_both_sides_of_the_diff_run(capsys):
     before, after = capsys.readouterr().out.splitlines()
     assert before == after == "torch.Size([10])"
     assert len(re.findall(r"^\+(?!from |import )", diff, re.M)) == 5
-
-
-def test_the_prior_of_your_own_runs():
-    page = (DOCS / "extending.md").read_text()
-    scope: dict = {}
-    exec(compile(re.search(r"```python\n(.*?)```", page, re.S)[1], "extending.md", "exec"), scope)
-    actions, target = torch.rand(2, 2, 3, 1)
-    history = window_history(actions, torch.tensor([[0], [3]]), target, chunk_length=3)
-    source = scope["LastAction"](3, sigma=0.3).distribution(history)
-    assert source.warm[..., 0].tolist() == [[False] * 3, [True] * 3]
-    assert (source.loc[1] == history["actions"][1, -1]).all()
 
 
 def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):

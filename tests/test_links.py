@@ -50,10 +50,3 @@ def test_links_lead_to_files_and_headings_of_the_repository(page):
         assert target in kept and target.exists(), f"{link}: no such file"
         if anchor:
             assert anchor in _anchors(target), f"{link}: no such heading"
-
-
-def test_an_anchor_is_what_github_makes_of_a_heading(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("# `a.py`: one, *two*\n```\n# no heading\n```\n## H = 1 (Fig. 6)\n## Again\n## Again\n")
-    assert _anchors(page) == {"apy-one-two", "h--1-fig-6", "again", "again-1"}
-    assert LINK.findall("[a](b.md#c) ![p](q.png) `[x](y)` [k [l]](m.md)") == ["b.md#c", "q.png", "m.md"]

@@ -60,17 +60,6 @@ def test_rounds_are_interleaved_and_the_first_is_dropped():
     assert ratio == pytest.approx(3, rel=0.4)
 
 
-def test_steps_per_second_are_those_of_a_round():
-    class Fixed:
-        def times(self, *things):
-            for thing in things:
-                thing()
-            return [[2.0, 9.0, 1.0], [0.5, 0.1, 4.0]]
-
-    taken = throughput.steps_per_second(Fixed(), network=throughput.small_network, batch=4, calls=3)
-    assert taken == {"warmprior": 1.5, "torch": 6.0}
-
-
 @pytest.mark.slow
 def test_every_throughput_can_be_measured(tmp_path):
     script, out = throughput.__file__, ["--repeats", "1", "--out", str(tmp_path)]

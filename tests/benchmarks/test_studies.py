@@ -6,7 +6,6 @@ from itertools import product
 import budget
 import chunking
 import curvature
-import h5py
 import navigation1d
 import pytest
 import real_time_chunking
@@ -141,17 +140,6 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
     again = tmp_path / "runs" / "again"
     assert curvature.main(command_line(run=out, observations=10, out=again)) == 0
     assert stored(again, "curvature") == stored(out, "curvature")
-    # As from a file of those demonstrations alone, beside one of the others.
-    for name, kept in masks.items():
-        write_robomimic_file(tmp_path / f"{name}.hdf5", lengths=lengths, task="lift", masks={"kept": kept})
-        with h5py.File(tmp_path / f"{name}.hdf5", "a") as file:
-            for number in set(range(len(lengths))) - set(kept):
-                del file[f"data/demo_{number}"]
-            file["data"].attrs["total"] = sum(lengths[number] for number in kept)
-    apart = tmp_path / "runs" / "apart"
-    argv = options(tmp_path / "train.hdf5", apart, validation=tmp_path / "valid.hdf5", **few)
-    assert curvature.main(argv) == 0
-    assert stored(apart, "curvature") == stored(out, "curvature")
 
 
 @pytest.mark.parametrize("given", [False, True])

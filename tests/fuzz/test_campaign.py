@@ -7,11 +7,9 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.fuzz import sandbox
-from tests.fuzz.generators import SUBJECTS
 from tests.fuzz.sandbox import Outcome, attempt
 
 ROOT = Path(__file__).parents[2]
@@ -42,14 +40,6 @@ def test_outcomes(monkeypatch, load, kind):
     assert outcome.kind == kind
     assert outcome.failed == (kind not in ("equal", "refused"))
     assert len(ballast) > sandbox.LIMIT_BYTES
-
-
-@pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.name)
-def test_cases_repeat(tmp_path, subject):
-    subject.make(tmp_path)
-    for seed in range(1000, 1006):
-        first, again = (subject.mutate(tmp_path, np.random.default_rng(seed))[0] for _ in range(2))
-        assert first == again
 
 
 @pytest.mark.slow

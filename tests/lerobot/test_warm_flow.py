@@ -5,13 +5,12 @@ from tensordict import TensorDict
 from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.errors import raises
 from tests.lerobot.plugin_policies import flow_batch, flow_policy, one_observation
-from tests.toy_env import stirred
+from tests.toy_env import Halfway, stirred
 from warmprior import (
     HistoryObservation,
     Normalizer,
     PastPrior,
     RealTimeChunking,
-    StartPoint,
     VelocityMLP,
     keys,
 )
@@ -263,16 +262,6 @@ def test_the_flow_policy_sees_images(found, tmp_path):
             flow_policy(found, images=(3, 16, 16), **options)
     with raises(ValueError, "[3, h, w]", "observation.images.top", "[1, 16"):
         flow_policy(found, images=(1, 16, 16))
-
-
-class Halfway(StartPoint):
-    """Half of the source's noise, at half of the time."""
-
-    name = "halfway-in-lerobot"
-    time, noise_share = 0.5, 0.5
-
-    def forward(self, noise, history, observation):
-        return self.noise_share * noise
 
 
 def saved_policy(folder, **options):
