@@ -140,7 +140,7 @@ def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
     for page, table in (results.tables() | leaderboard.tables()).items():
         assert pages.with_tables(texts[page], table) == texts[page]
     text = "".join(texts.values())
-    played = {name for name, _ in pages.PLAYED.findall(text)}
+    played = {name for _, name, _ in pages.PLAYED.findall(text)}
     assert played == {path.stem for path in shared.DATA.glob("*.jsonl")}
     shown = set(re.findall(r"_static/results/(\w+)\.svg\)", text))
     assert shown == {path.stem for path in shared.OUT.iterdir()}

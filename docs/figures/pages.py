@@ -15,8 +15,8 @@ from lab.statistics import chosen_elsewhere
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches the marked table of a page."""
 
-PLAYED = re.compile(r"(?<=<!-- rows )(\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the table of a run's rows in a page."""
+PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the table of a run's rows in a page: by NFE and noise, by sigma, or by chunk length."""
 
 
 def played_table(name: str) -> str:
@@ -73,10 +73,33 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
     return f"| {nfe} | {noise} | " + " | ".join(entries) + " |"
 
 
+def study_table(column: str, name: str) -> str:
+    """Return success of a run in Markdown, in percent: a line per setting and source, a column per value."""
+    rows = read_played(name)
+    values = sorted(rows[column].unique(), reverse=column == "sigma")
+    text = [f"| {'σ' if column == 'sigma' else 'H'} | {' | '.join(f'{v:g}' for v in values)} |"]
+    text.append("|---" * (1 + len(values)) + "|")
+    for (task, data), part in rows.groupby(["task", "data"], sort=False):
+        for source in shown_sources(part):
+            outcomes = (
+                part[part["source"] == source]
+                .groupby(column)["solved"]
+                .agg(lambda solved: 100 * np.concatenate(list(solved)).mean())
+            )
+            entries = [f"{outcomes[v] + 1e-6:.0f}" if v in outcomes else "" for v in values]
+            text.append(f"| {task} {data}, {SOURCES[source][0]} | {' | '.join(entries)} |")
+    return "\n".join(text) + "\n"
+
+
 def with_tables(page: str, text: str) -> str:
     """Return a page with its table, and the tables of the runs whose rows it names."""
+
+    def table_of(match: re.Match[str]) -> str:
+        kind, name, end = match.groups()
+        return f"{kind} {name}{end}{played_table(name) if kind == 'rows' else study_table(kind, name)}"
+
     page = TABLE.sub(lambda _: text, page)
-    return PLAYED.sub(lambda match: f"{match[1]}{match[2]}{played_table(match[1])}", page)
+    return PLAYED.sub(table_of, page)
 
 
 def write(pages: Mapping[Path, str]) -> None:
