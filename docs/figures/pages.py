@@ -77,7 +77,7 @@ def study_table(column: str, name: str) -> str:
     """Return success of a run in Markdown, in percent: a line per setting and source, a column per value."""
     rows = read_played(name)
     values = sorted(rows[column].unique(), reverse=column == "sigma")
-    text = [f"| {'σ' if column == 'sigma' else 'H'} | {' | '.join(f'{v:g}' for v in values)} |"]
+    text = [f"| {'H' if column == 'chunk' else column} | {' | '.join(f'{v:g}' for v in values)} |"]
     text.append("|---" * (1 + len(values)) + "|")
     for (task, data), part in rows.groupby(["task", "data"], sort=False):
         for source in shown_sources(part):
