@@ -84,9 +84,7 @@ def sentences() -> dict[str, list[str]]:
     }
     loss = [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in (GAUSSIAN, *WARM)]
     few_longer = [f"{whole(pusht(50, s, 9))}" for s in (PAST, CORRELATED, GAUSSIAN)]
-    noise = read("noise")
-    noise = noise[(noise["style"] == "mh") & (noise["task"] == "square") & (noise["source"] == PAST)]
-    noise = noise[(noise["seeds"] == 1) & (noise["actions"] == "deltas")].set_index("sigma")["success"]
+    noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     mip = board.loc["mip", 2]
     return {
@@ -121,5 +119,5 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Preview and correlated noise {nine[PREVIEW]}; at one step they solve {one[GAUSSIAN]}, "
             f"{one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
         ],
-        "faq.md": [f"({whole(noise[0.25])}% at 0.25, {whole(noise[0.1])}% at 0.1)"],
+        "faq.md": [f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0)"],
     }
