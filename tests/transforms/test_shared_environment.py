@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RenameTransform, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
@@ -24,7 +24,6 @@ from warmprior.deploy import AsyncExecutor
 from warmprior.training import play_episode
 
 H, LENGTH = 3, 7
-CHUNK = ("agents", "chunk")
 
 
 class TwoArms(EnvBase):
@@ -125,11 +124,43 @@ def test_an_action_that_nobody_chooses_is_refused(keys):
         ChunkStep(H, action_keys=keys, chunk_keys=[])
 
 
-def test_a_group_of_agents_is_refused():
-    env = CountingEnv(LENGTH)
-    env.action_spec = Composite(agents=Composite(action=Unbounded((3, 2))))
-    with raises(ValueError, "(3, 2)", "agents"):
-        TransformedEnv(env, ChunkStep(H, action_keys=[("agents", "action")])).rollout(1)
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("around", [lambda env: env, lambda env: SerialEnv(2, lambda: env)])
+def test_a_group_of_agents_is_refused(n, around):
+    def make_env():
+        env = CountingEnv(LENGTH)
+        env.observation_spec = Composite(agents=Composite(observation=Unbounded((n, 4)), shape=(n,)))
+        env.action_spec = Composite(agents=Composite(action=Unbounded((n, 2)), shape=(n,)))
+        return env
+
+    policy, key = actor(PastPrior(H), 2, "agents", "observation"), ("agents", "action")
+    for transforms in (
+        lambda: policy_transforms(policy, action_key=key),
+        lambda: ChunkStep(H, action_keys=[key]),
+        lambda: ObservationStack(1, observation_key=("agents", "observation")),
+    ):
+        with raises(ValueError, "groups of agents"):
+            _ = TransformedEnv(around(make_env()), transforms()).specs
+        with raises(ValueError, "groups of agents"):
+            _ = around(TransformedEnv(make_env(), transforms())).specs
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_nested_keys_of_one_policy(inside):
+    policy = actor(PastPrior(H), 2, "left", "observation")
+
+    def renamed():
+        places = [("left", "observation")], ["action"], [("left", "action")]
+        return TransformedEnv(CountingEnv(LENGTH), RenameTransform(["observation"], *places))
+
+    def chunked(env):
+        return TransformedEnv(env, policy_transforms(policy, action_key=("left", "action")))
+
+    env = SerialEnv(2, lambda: chunked(renamed())) if inside else chunked(SerialEnv(2, renamed))
+    check_env_specs(env)
+    rollout = env.rollout(10, policy)
+    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
+    assert torch.equal(rollout["left", "source", "loc"][:, 1:], rollout["left", "chunk"][:, :-1])
 
 
 def test_one_key_of_an_environment_works_as_before():

@@ -433,8 +433,8 @@ class ChunkStep(EnvTransform):
             if leaf.ndim != input_spec.ndim + 1:
                 raise ValueError(
                     f"ChunkStep takes actions that are vectors [*B, d_a], but {action_key!r} has shape "
-                    f"{tuple(leaf.shape)} for the batch size {tuple(input_spec.shape)}: make it a vector "
-                    "before, a number with UnsqueezeTransform. Groups of agents are not supported"
+                    f"{tuple(leaf.shape)} for the batch size {tuple(input_spec.shape)}: make a number a "
+                    "vector with UnsqueezeTransform; groups of agents [*B, n, d_a] are not supported"
                 )
             *batch, width = leaf.shape
             actions[chunk_key] = leaf.unsqueeze(-2).expand(*batch, self.prediction_length, width).clone()

@@ -99,6 +99,13 @@ class ObservationStack(EnvTransform):
                 f"ObservationStack found no {self.observation_key!r}, only "
                 f"{list(observations.keys(True, True))}: name the observation with observation_key"
             )
+        *branch, _ = key if isinstance(key := self.observation_key, tuple) else (key,)
+        shape = observations[tuple(branch)].shape if branch else observations.shape
+        if shape != observations.shape:
+            raise ValueError(
+                f"ObservationStack found {key!r} in a branch of shape {list(shape)}, in an environment of "
+                f"batch size {list(observations.shape)}: groups of agents are not supported"
+            )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Insert the stack's dimension after those of the batch."""
