@@ -76,6 +76,10 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
 def study_table(column: str, name: str) -> str:
     """Return success of a run in Markdown, in percent: a line per setting and source, a column per value."""
     rows = read_played(name)
+    if len(rows[["nfe", "noise", "iterations"]].drop_duplicates()) > 1:
+        raise ValueError(
+            f"{name}: these rows differ in more than {column}, so no column per value holds them"
+        )
     values = sorted(rows[column].unique(), reverse=column == "sigma")
     text = [f"| {'H' if column == 'chunk' else column} | {' | '.join(f'{v:g}' for v in values)} |"]
     text.append("|---" * (1 + len(values)) + "|")

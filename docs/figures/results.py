@@ -153,7 +153,8 @@ def memory() -> None:
     for axis, task in zip(axes, ("square", "transport"), strict=True):
         for _, row in rows[rows["task"] == task].iterrows():
             label, color, mark = SOURCES[row["source"]]
-            axis.plot(row["gain"], row["success"], mark, ms=8, alpha=0.85, color=color, label=label)
+            face = {"mfc": "none", "mew": 1.5} if color == INK else {"alpha": 0.85}
+            axis.plot(row["gain"], row["success"], mark, ms=8, color=color, label=label, **face)
         what = "memory gain (0: past ignored, 1: past copied)"
         finish(axis, f"{task}, 300 demonstrations of six operators", xlabel=what, ylim=(-4, 100))
     picture.supylabel("success in percent", fontsize=10)

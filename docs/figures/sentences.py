@@ -13,11 +13,18 @@ from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read, read_played
 
 WARM = (PAST, PREVIEW, CORRELATED)
 TEN, TWENTY_FIVE = "10: square, can and stack", "25: square, can and stack"
+ONE_ARM, EIGHT = "150 or 300: six settings of one arm", "150 or 300: all eight settings"
 
 
 def whole(number: float) -> int:
     """Return the number as tables round it."""
     return int(f"{number + 1e-6:.0f}")
+
+
+def common(numbers: list[float]) -> int:
+    """Return the one value that all numbers round to."""
+    (value,) = {whole(number) for number in numbers}
+    return value
 
 
 def span(numbers: list[float]) -> str:
@@ -41,7 +48,9 @@ def pair(run: str, source: str) -> str:
     """Return the episodes won and lost against the Gaussian source, over all NFE."""
     won = lost = 0
     for nfe in 9, 3, 1:
-        both = [played(run, name, nfe).set_index("seed")["solved"] for name in (source, GAUSSIAN)]
+        both = [
+            played(run, name, nfe).set_index("seed")["solved"].sort_index() for name in (source, GAUSSIAN)
+        ]
         for outcomes, base in zip(*both, strict=True):
             won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
     return f"{won} : {lost}"
@@ -53,6 +62,21 @@ def scripted(name: str, source: str, nfe: int = 1) -> float:
     return rows[(rows["setting"] == name) & (rows["source"] == source) & (rows["nfe"] == nfe)][
         "success"
     ].item()
+
+
+def mean_of(style: str, count: int, source: str, nfe: int) -> float:
+    """Return the mean success over the tasks that have so many demonstrations of a style."""
+    rows = read("steps" if count < 150 else "one_step")
+    rows = rows[(rows["style"] == style) & (rows["demonstrations"] == count) & (rows["nfe"] == nfe)]
+    return rows[rows["source"] == source]["success"].mean()
+
+
+def behind(style: str) -> int:
+    """Return by how many points WP-Preview is behind on square, at nine steps."""
+    rows = read("steps")
+    rows = rows[(rows["task"] == "square") & (rows["style"] == style) & (rows["demonstrations"] >= 150)]
+    rates = rows[rows["nfe"] == 9].set_index("source")["success"]
+    return whole(rates[GAUSSIAN] - rates[PREVIEW])
 
 
 def pusht(count: int, source: str, nfe: int) -> float:
@@ -70,7 +94,6 @@ def sentences() -> dict[str, list[str]]:
         for name in (TEN, TWENTY_FIVE)
         for source in (PAST, PREVIEW)
     ]
-    many = "150 or 300: all eight settings"
     longer = {
         nfe: [solved("square_mh_80000", s, nfe) - solved("square_mh_80000", GAUSSIAN, nfe) for s in WARM]
         for nfe in (9, 1)
@@ -87,16 +110,27 @@ def sentences() -> dict[str, list[str]]:
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     mip = board.loc["mip", 2]
+    joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
+    six = [mean_of("mh", 300, GAUSSIAN, 1) - mean_of("mh", 300, s, 1) for s in (PAST, PREVIEW)]
+    ten = {nfe: [mean_of("ph", 10, s, nfe) for s in (GAUSSIAN, PAST, PREVIEW)] for nfe in (9, 1)}
+    steps_gain = mean_of("ph", 25, GAUSSIAN, 3) - mean_of("ph", 25, GAUSSIAN, 1)
+    correlated = [scripted(name, CORRELATED) - scripted(name, GAUSSIAN) for name in (ONE_ARM, EIGHT)]
     return {
         "../README.md": [
             f"({whole(mip['mean'])}% on average)",
             f"WP-Past and WP-Preview succeed {span(few)} points more often",
-            f"succeeds {whole(scripted(many, CORRELATED) - scripted(many, GAUSSIAN))} points more often",
+            f"succeeds {whole(correlated[1])} points more often",
             f"succeed {span(longer[9])} points more often at nine steps and "
             f"{span([-n for n in longer[1]])} less often at one",
         ],
         "which_source.md": [
-            f"succeeds in {door[3][GAUSSIAN]}% of the episodes "
+            f"{span(joints)}% at three steps",
+            f"WP-Past and WP-Preview succeed {span(six)} points less often",
+            f"{whole(steps_gain)} points more often at three",
+            f"solve {span(ten[9])}% at nine steps, and {span(ten[1])}% at one",
+            f"{span([-n for n in longer[1]])} less often at one",
+            "at three steps "
+            f"the Gaussian source succeeds in {door[3][GAUSSIAN]}% of the episodes "
             f"and correlated noise in {door[3][CORRELATED]}%",
             f"WP-Past and WP-Preview succeed {span(few)} points more often",
             f"the Gaussian source solves {whole(pusht(206, GAUSSIAN, 9))}% at nine steps, "
@@ -108,16 +142,19 @@ def sentences() -> dict[str, list[str]]:
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
         ],
         "leaderboard.md": [
-            f"({best[9][GAUSSIAN]}%; WP-Past and WP-Preview {best[9][PAST]})",
+            f"({best[9][GAUSSIAN]}%; WP-Past and WP-Preview {common([best[9][PAST], best[9][PREVIEW]])})",
             f"correlated noise solves {best[1][CORRELATED]}% and the Gaussian source {best[1][GAUSSIAN]}",
             f"({whole(mip[DOOR])} against {max(n for at in door.values() for n in at.values())}%)",
+            f"it solves {whole(solved('pusht_50', 'mip-past', 2, 0))}%, and MIP {whole(mip['Push-T, 50'])}",
             f"({pair('door_80000', CORRELATED)} over all steps)",
             f"with 206 ({pair('pusht_206_80000', PAST)})",
         ],
         "results.md": [
+            f"on average succeeds {span(correlated)} points more often",
+            f"by {behind('ph')} points with one operator, by {behind('mh')} with six",
             f"at nine the Gaussian source solves {nine[GAUSSIAN]}%, WP-Past {nine[PAST]}, "
-            f"WP-Preview and correlated noise {nine[PREVIEW]}; at one step they solve {one[GAUSSIAN]}, "
-            f"{one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
+            f"WP-Preview and correlated noise {common([nine[PREVIEW], nine[CORRELATED]])}; at one step "
+            f"they solve {one[GAUSSIAN]}, {one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
         ],
         "faq.md": [f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0)"],
     }

@@ -22,7 +22,7 @@ DOCS = Path(__file__).parents[1]
 DATA, OUT = DOCS / "results", DOCS / "_static" / "results"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
 CORRELATED, WIDE = "past,correlation=0.5", "past,sigma=1"
-SOURCES = {  # label, colour and marker in charts
+SOURCES = {  # label, colour and marker in charts, where markers of INK are hollow
     GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
     PAST: ("WP-Past", "#1f77b4", "o"),
     PREVIEW: ("WP-Preview", "#d95f02", "o"),

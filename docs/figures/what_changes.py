@@ -24,7 +24,7 @@ from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navi
 from warmprior.training import train_policy
 
 OUT = DOCS / "_static" / "what_changes.png"
-ABOVE, BELOW = "#1f77b4", "#d95f02"
+ABOVE, BELOW, ONE = "#1f77b4", "#d95f02", "#1b9e77"
 SOURCES = {
     "Gaussian source": GaussianPrior(16),
     "WP-Past: what was just executed": PastPrior(16),
@@ -76,7 +76,7 @@ def main() -> None:
                 )
             for line in heights[:24]:
                 axis.plot(x, line, color=ABOVE if line[0] > 0 else BELOW, lw=0.6, alpha=0.6)
-            axis.plot(x, heights[0], color=INK, lw=1.8, marker="o", ms=3.5, markevery=16)
+            axis.plot(x, heights[0], color=ONE, lw=1.8, marker="o", ms=3.5, markevery=16)
             axis.set(ylabel="height of the robot", ylim=(-1.5, 1.5))
     flows[-1].set_xlabel("time of the flow")
     paths[-1].set_xlabel("position along the way")

@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 from itertools import product
 
@@ -76,21 +75,6 @@ def test_sigma_study(finished, dataset, validation):
     assert sigma.main([*argv, "--resume"]) == 0
     assert written(finished.parent) == after
     assert stored(out) == rows and (out / "report.md").read_text() == report
-
-
-def test_a_run_that_has_changed_is_not_mixed_in(finished, dataset, validation, tmp_path, capsys):
-    out, copy = tmp_path / "flow", tmp_path / "copy"
-    shutil.copytree(finished, copy)
-    os.symlink(finished.parent / "policies", tmp_path / "policies")
-    argv = command_line(run=copy, **measured(out, validation))
-    assert "fewer seeds than --seeds 3" in refused(curvature.main, [*argv, "--seeds", "3"], capsys)
-    assert curvature.main(argv) == 0
-    changed = described(copy, "options")
-    changed["options"]["data"]["task"] = ["evil:task"]
-    (copy / "options.json").write_text(json.dumps(changed))
-    kept = (out / "options.json").read_text()
-    assert "has its own --task" in refused(curvature.main, ["--resume", "--out", str(out)], capsys)
-    assert (out / "options.json").read_text() == kept
 
 
 def test_chunk_lengths_of_two_tasks(tmp_path):

@@ -161,8 +161,3 @@ def test_nested_keys_of_one_policy(inside):
     rollout = env.rollout(10, policy)
     assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3, 1]] * 2
     assert torch.equal(rollout["left", "source", "loc"][:, 1:], rollout["left", "chunk"][:, :-1])
-
-
-def test_one_key_of_an_environment_works_as_before():
-    env = TransformedEnv(CountingEnv(LENGTH), ChunkStep(H, chunk_keys=["chunk"]))
-    assert env.rollout(9)["next", "reward"].flatten().tolist() == [6.0, 15.0, 7.0]
