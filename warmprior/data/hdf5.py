@@ -394,8 +394,8 @@ class RobomimicReader(DemonstrationReader):
     def __init__(self, file: h5py.File) -> None:
         self.file = file
 
-    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
-        """Read the first rows of one array of a demo, block by block; ``out`` may be a strided view."""
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of one array of a demo, block by block; ``out`` may be a strided view."""
         dataset: Any = member(self.file, f"data/{demo}/{key}", "dataset")
         if dataset is None and key == "rewards":
             out[...] = 0
@@ -407,8 +407,8 @@ class RobomimicReader(DemonstrationReader):
         for start in range(0, len(out), BLOCK):
             rows = out[start : start + BLOCK]
             with reading(self.file, f"data/{demo}/{key}"):
-                block = dataset[start : start + len(rows)]
-            store_finite(block, rows, what, _LEAVE_OUT, start)
+                block = dataset[first + start : first + start + len(rows)]
+            store_finite(block, rows, what, _LEAVE_OUT, first + start)
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Read the images of a demo, block by block."""

@@ -45,14 +45,14 @@ class LeRobotReader(DemonstrationReader):
         features = index.metadata.features
         self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
 
-    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
-        """Read the first rows of an array; rewards are ``next.reward``, ``next.success``, or else zeros."""
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of an array; rewards are ``next.reward``, ``next.success``, or else zeros."""
         feature, part = self._place(key)
         if feature is None:
             out[...] = 0
             return
-        block = self._rows(self._episodes[demo], feature)[: len(out), part]
-        store_finite(block, out, self.name(demo, key), _REBUILD)
+        block = self._rows(self._episodes[demo], feature)[first : first + len(out), part]
+        store_finite(block, out, self.name(demo, key), _REBUILD, first)
 
     def _rows(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
         """Return all rows of an episode, ``[rows, width]``."""

@@ -146,15 +146,15 @@ class MinariReader(DemonstrationReader):
                 observations = observations[part]
         return np.asarray(observations)[:-1]  # the last one follows the last action
 
-    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
         """Do as the base class describes."""
         values = self._values(demo, key)
-        block = values.reshape(len(values), -1)[: len(out)]
+        block = values.reshape(len(values), -1)[first : first + len(out)]
         if block.shape != out.shape:
             raise DatasetError(
                 f"{self.name(demo, key)} has shape {values.shape}, not {list(out.shape)}: download it again"
             )
-        store_finite(block, out, self.name(demo, key), "Delete the episode, or download it again.")
+        store_finite(block, out, self.name(demo, key), "Delete the episode, or download it again.", first)
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Do as the base class describes."""

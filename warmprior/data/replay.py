@@ -93,8 +93,8 @@ class DemonstrationReader(ABC):
     """A reader of demonstrations' values, given their :class:`DatasetIndex`."""
 
     @abstractmethod
-    def numbers(self, demo: str, key: str, out: np.ndarray) -> None:
-        """Read and check the first rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"``.
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read and check rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"``, from ``first`` on.
 
         Rewards that are not recorded are zeros.
         """
@@ -283,30 +283,33 @@ def _reserve(mapped: Any) -> None:
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:
     """Read recorded poses, with 6-d rotations instead of rotation vectors."""
     arms = out.shape[-1] // 10
-    recorded = np.empty((len(out), 7 * arms))
-    reader.numbers(demo, "actions", recorded)
-    place, turn, gripper = torch.from_numpy(recorded).unflatten(-1, (arms, 7)).split((3, 3, 1), -1)
-    turn = matrix_to_rotation_6d(rotvec_to_matrix(turn))
-    out[...] = torch.cat((place, turn, gripper), -1).flatten(-2).numpy()
+    for first in range(0, len(out), BLOCK):
+        rows = out[first : first + BLOCK]
+        recorded = np.empty((len(rows), 7 * arms))
+        reader.numbers(demo, "actions", recorded, first)
+        place, turn, gripper = torch.from_numpy(recorded).unflatten(-1, (arms, 7)).split((3, 3, 1), -1)
+        turn = matrix_to_rotation_6d(rotvec_to_matrix(turn))
+        rows[...] = torch.cat((place, turn, gripper), -1).flatten(-2).numpy()
 
 
 def _read_absolute(
     reader: DemonstrationReader, demo: str, out: np.ndarray, output_max: Tensor, base_rotation: Tensor
 ) -> None:
-    arms = len(base_rotation)
-    deltas, positions, quaternions = (np.empty((len(out), n * arms)) for n in (7, 3, 4))
-    reader.numbers(demo, "actions", deltas)
-    for arm in range(arms):
-        position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
-        reader.numbers(demo, position, positions[:, 3 * arm : 3 * arm + 3])
-        turns = quaternions[:, 4 * arm : 4 * arm + 4]
-        reader.numbers(demo, quaternion, turns)
-        off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
-        if off.max() > UNIT_TOLERANCE:
-            what, row = reader.name(demo, quaternion), int(off.argmax())
-            raise DatasetError(f"{what} is not a rotation in row {row}: its length is not 1")
-    units = {"output_max": output_max, "base_rotation": base_rotation}
-    out[...] = to_absolute(*map(torch.from_numpy, (deltas, positions, quaternions)), **units).numpy()
+    arms, units = len(base_rotation), {"output_max": output_max, "base_rotation": base_rotation}
+    for first in range(0, len(out), BLOCK):
+        rows = out[first : first + BLOCK]
+        deltas, positions, quaternions = (np.empty((len(rows), n * arms)) for n in (7, 3, 4))
+        reader.numbers(demo, "actions", deltas, first)
+        for arm in range(arms):
+            position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
+            reader.numbers(demo, position, positions[:, 3 * arm : 3 * arm + 3], first)
+            turns = quaternions[:, 4 * arm : 4 * arm + 4]
+            reader.numbers(demo, quaternion, turns, first)
+            off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
+            if off.max() > UNIT_TOLERANCE:
+                what, row = reader.name(demo, quaternion), first + int(off.argmax())
+                raise DatasetError(f"{what} is not a rotation in row {row}: its length is not 1")
+        rows[...] = to_absolute(*map(torch.from_numpy, (deltas, positions, quaternions)), **units).numpy()
 
 
 def _conventions(index: DatasetIndex, absolute_actions: bool) -> tuple[Tensor, Tensor] | None:
