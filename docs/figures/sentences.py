@@ -62,44 +62,23 @@ def pair(run: str, source: str) -> str:
     return f"{won} : {lost}"
 
 
-def scripted(name: str, source: str, nfe: int = 1) -> float:
-    """Return the mean success on scripted demonstrations."""
-    rows = read("means")
-    return rows[(rows["setting"] == name) & (rows["source"] == source) & (rows["nfe"] == nfe)][
-        "success"
-    ].item()
+def recorded(file: str, source: str, nfe: int, **chosen: object) -> float:
+    """Return the mean success of a source over those rows of a CSV file that have the chosen values."""
+    rows = read(file)
+    for column, value in {"source": source, "nfe": nfe, **chosen}.items():
+        rows = rows[rows[column] == value]
+    return rows["success"].mean()
 
 
-def mean_of(style: str, count: int, source: str, nfe: int) -> float:
-    """Return the mean success over the tasks that have so many demonstrations of a style."""
-    rows = read("steps" if count < 150 else "one_step")
-    rows = rows[(rows["style"] == style) & (rows["demonstrations"] == count) & (rows["nfe"] == nfe)]
-    return rows[rows["source"] == source]["success"].mean()
-
-
-def behind(style: str) -> int:
-    """Return by how many points WP-Preview is behind on square, at nine steps."""
-    rows = read("steps")
-    rows = rows[(rows["task"] == "square") & (rows["style"] == style) & (rows["demonstrations"] >= 150)]
-    rates = rows[rows["nfe"] == 9].set_index("source")["success"]
-    return whole(rates[GAUSSIAN] - rates[PREVIEW])
-
-
-def pusht(count: int, source: str, nfe: int) -> float:
-    """Return the success on Push-T."""
-    rows = read("pusht")
-    rows = rows[(rows["demonstrations"] == count) & (rows["source"] == source) & (rows["nfe"] == nfe)]
-    return rows["success"].item()
+def gain(file: str, source: str, nfe: int, **chosen: object) -> float:
+    """Return how many points a source is ahead of the Gaussian source in these rows."""
+    return recorded(file, source, nfe, **chosen) - recorded(file, GAUSSIAN, nfe, **chosen)
 
 
 def sentences() -> dict[str, list[str]]:
     """Return the sentences of each page."""
     board = standings().set_index(["source", "nfe"])
-    few = [
-        scripted(name, source) - scripted(name, GAUSSIAN)
-        for name in (TEN, TWENTY_FIVE)
-        for source in (PAST, PREVIEW)
-    ]
+    few = [gain("means", s, 1, setting=name) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     longer = {
         nfe: [solved("square_mh_80000", s, nfe) - solved("square_mh_80000", GAUSSIAN, nfe) for s in WARM]
         for nfe in (9, 1)
@@ -112,19 +91,30 @@ def sentences() -> dict[str, list[str]]:
         for nfe in (9, 1)
     }
     loss = [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in (GAUSSIAN, *WARM)]
-    few_longer = [f"{whole(pusht(50, s, 9))}" for s in (PAST, CORRELATED, GAUSSIAN)]
+    pusht = {
+        count: {s: recorded("pusht", s, 9, demonstrations=count) for s in (GAUSSIAN, *WARM)}
+        for count in (50, 206)
+    }
+    fifty = [whole(pusht[50][s]) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     mip = board.loc["mip", 2]
     joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
-    six = [mean_of("mh", 300, GAUSSIAN, 1) - mean_of("mh", 300, s, 1) for s in (PAST, PREVIEW)]
-    ten = {nfe: [mean_of("ph", 10, s, nfe) for s in (GAUSSIAN, PAST, PREVIEW)] for nfe in (9, 1)}
+    six = [-gain("one_step", s, 1, style="mh") for s in (PAST, PREVIEW)]
+    ten = {
+        nfe: [recorded("steps", s, nfe, demonstrations=10) for s in (GAUSSIAN, PAST, PREVIEW)]
+        for nfe in (9, 1)
+    }
     fall = {
         s: f"{whole(two_seeds_of('door_20000', s))} to {whole(two_seeds_of('door_80000', s))}"
         for s in (GAUSSIAN, PAST)
     }
-    steps_gain = mean_of("ph", 25, GAUSSIAN, 3) - mean_of("ph", 25, GAUSSIAN, 1)
-    correlated = [scripted(name, CORRELATED) - scripted(name, GAUSSIAN) for name in (ONE_ARM, EIGHT)]
+    three, single = (recorded("steps", GAUSSIAN, nfe, demonstrations=25) for nfe in (3, 1))
+    correlated = [gain("means", CORRELATED, 1, setting=name) for name in (ONE_ARM, EIGHT)]
+    behind = [
+        whole(-gain("steps", PREVIEW, 9, task="square", style=style, demonstrations=count))
+        for style, count in (("ph", 150), ("mh", 300))
+    ]
     return {
         "../README.md": [
             f"({whole(mip['mean'])}% on average)",
@@ -136,7 +126,7 @@ def sentences() -> dict[str, list[str]]:
         "which_source.md": [
             f"{span(joints)}% at three steps",
             f"WP-Past and WP-Preview succeed {span(six)} points less often",
-            f"{whole(steps_gain)} points more often at three",
+            f"{whole(three - single)} points more often at three",
             f"the Gaussian source falls from {fall[GAUSSIAN]}% at three steps, WP-Past from {fall[PAST]}",
             f"solve {span(ten[9])}% at nine steps, and {span(ten[1])}% at one",
             f"{span([-n for n in longer[1]])} less often at one",
@@ -144,10 +134,10 @@ def sentences() -> dict[str, list[str]]:
             f"the Gaussian source succeeds in {door[3][GAUSSIAN]}% of the episodes "
             f"and correlated noise in {door[3][CORRELATED]}%",
             f"WP-Past and WP-Preview succeed {span(few)} points more often",
-            f"the Gaussian source solves {whole(pusht(206, GAUSSIAN, 9))}% at nine steps, "
-            f"and warm sources {span([pusht(206, s, 9) for s in WARM])}%",
+            f"the Gaussian source solves {whole(pusht[206][GAUSSIAN])}% at nine steps, "
+            f"and warm sources {span([pusht[206][s] for s in WARM])}%",
             f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (one seed)",
-            f"lead with {few_longer[0]} and {few_longer[1]}%, against the Gaussian source's {few_longer[2]}",
+            f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
             f"solves {whole(mip['Push-T, 206'])}% with 206",
             f"all warm sources succeed {span(longer[9])} points more",
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
@@ -162,7 +152,7 @@ def sentences() -> dict[str, list[str]]:
         ],
         "results.md": [
             f"on average succeeds {span(correlated)} points more often",
-            f"by {behind('ph')} points with one operator, by {behind('mh')} with six",
+            f"by {behind[0]} points with one operator, by {behind[1]} with six",
             f"at nine the Gaussian source solves {nine[GAUSSIAN]}%, WP-Past {nine[PAST]}, "
             f"WP-Preview and correlated noise {common([nine[PREVIEW], nine[CORRELATED]])}; at one step "
             f"they solve {one[GAUSSIAN]}, {one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
