@@ -144,6 +144,17 @@ def test_a_gradient_is_shortened_to_the_norm_and_keeps_its_direction(
     assert torch.equal(gradients[1e9], whole)  # bit by bit
 
 
+def test_a_network_that_cannot_be_compiled_is_refused_in_one_sentence(tmp_path, monkeypatch):
+    def backend(graph, inputs):
+        raise OSError("no g++\nand so on")
+
+    compile_ = nn.Module.compile
+    monkeypatch.setattr(nn.Module, "compile", lambda module, **options: compile_(module, backend=backend))
+    cloning = training(tmp_path, CONFIG, actor=actor_for(network=mlp()), compile=True)
+    with pytest.raises(ValueError, match=r"^the network cannot be compiled \(no g\+\+\): install .*$"):
+        cloning.step()
+
+
 def test_a_finished_training_stays_as_it_is(tmp_path):
     first = finished(tmp_path)
     before = (tmp_path / "state.safetensors").read_bytes()

@@ -75,7 +75,7 @@ class BehaviourCloning:
 
     Raises:
         ValueError: if a batch cannot be divided among the processes, the state is damaged or belongs to
-            another run, or the policy could not be reloaded once saved.
+            another run, the policy could not be reloaded once saved, or the network cannot be compiled.
         TypeError: if the policy cannot be saved.
 
     Examples:

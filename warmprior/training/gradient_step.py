@@ -91,13 +91,17 @@ class GradientStep:
         self.loss_module.actor_network.network.compile(mode="reduce-overhead" if self._graphs else None)
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
-        """Take a step on a batch of windows; return its loss, a detached scalar."""
+        """Take a step on a batch of windows; return its loss, a detached scalar.
+
+        Raises:
+            ValueError: if the network cannot be compiled.
+        """
         if self._count_padding:
             batch = batch.exclude(keys.IS_PAD)
         if self._graphs:  # the graphs may overwrite the outputs of the last step
             torch.compiler.cudagraph_mark_step_begin()
         with self._precision():
-            loss = self._loss(batch)
+            loss = self._forward(batch)
         self.optimizer.zero_grad()
         loss.backward()
         if self._max_grad_norm is not None:  # gradients are already averaged over all processes
@@ -106,6 +110,20 @@ class GradientStep:
         self.schedule.step()
         self._average()
         return loss.detach()
+
+    def _forward(self, batch: TensorDictBase) -> Tensor:
+        try:
+            return cast(Tensor, self._loss(batch))
+        except RuntimeError as error:  # a network is compiled when it is first called
+            from torch._dynamo.exc import TorchDynamoException
+
+            if not isinstance(error, TorchDynamoException):
+                raise
+            reason = str(getattr(error, "inner_exception", error)).partition("\n")[0]
+            raise ValueError(
+                f"the network cannot be compiled ({reason}): install a C++ compiler, such as g++, or train "
+                "without compile"
+            ) from error
 
     def averaged(self, actor: WarmPriorActor) -> WarmPriorActor:
         """Return the policy with the averaged weights."""

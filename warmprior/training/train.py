@@ -119,7 +119,7 @@ def train_policy(
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`; in order by default.
         see_history: True if the network sees the last actions.
         device: device of the network and, if they fit, the demonstrations.
-        compile: True compiles the network with :func:`torch.compile`.
+        compile: True compiles the network with :func:`torch.compile`, which needs a C++ compiler.
         logger: a TorchRL logger, closed at the end.
         description: label of the progress bar; no bar if ``None``.
         progress: called with the number of iterations, at the start and after each iteration.
@@ -134,8 +134,8 @@ def train_policy(
         TypeError: if the demonstrations or the prior have the wrong type.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
-        ValueError: if the demonstrations have the wrong form, or the folder belongs to a different training
-            run.
+        ValueError: if the demonstrations have the wrong form, the folder belongs to a different training
+            run, or the network cannot be compiled.
 
     Examples:
         >>> import torch
