@@ -105,6 +105,15 @@ def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
     assert training.agent.state_keys[0] == "features"
 
 
+def test_an_agent_of_raw_images_is_refused_before_the_first_episode(policy, tmp_path):
+    training = PriorSpaceTraining(
+        policy, lambda seed: environment(policy, seed), make_config(), tmp_path, evaluation_seed=0
+    )
+    with raises(ValueError, "'observation'", "EncodeObservation"):
+        training.run()
+    assert training.steps == 0 and not training.state_path.exists()
+
+
 def test_a_policy_of_vectors_has_nothing_to_encode():
     with raises(ValueError, "VelocityMLP", "encoder"):
         EncodeObservation(make_actor())

@@ -1,10 +1,12 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.errors import raises
 from tests.toy_env import Halfway, mlp_actor
 from warmprior import BoxTanhNormal, GaussianPrior, PastPrior, PriorDecoder, ResidualSampler
+from warmprior.rl import make_prior_space_actor, make_prior_space_critic
 
 stats = pytest.importorskip("scipy.stats")
 
@@ -87,3 +89,17 @@ def test_sampler_options():
     assert ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5)).distribution == "uniform"
     with raises(KeyError, "PriorAnchor"):
         ResidualSampler(decoder)(TensorDict({}, [2]))
+
+
+@pytest.mark.parametrize("make", [make_prior_space_actor, make_prior_space_critic])
+def test_observations_in_doubles_are_read(make):
+    torch.manual_seed(0)
+    box = {"delta": 0.5} if make is make_prior_space_actor else {}
+    module = make(D_A, 4, P, 1, hidden_dim=8, num_layers=1, **box)
+    chunks = {"anchor": torch.rand(5, P, D_A), "delta": torch.rand(5, P, D_A)}
+    single = TensorDict({"observation": torch.rand(5, 1, 4), "prior": chunks}, [5])
+    (key,) = module.out_keys[-1:]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        values = [module(data.clone())[key] for data in (single, single.double())]
+    assert values[1].dtype == torch.float32
+    torch.testing.assert_close(*values)

@@ -4,6 +4,7 @@ import torch
 from tests.errors import raises
 from tests.rl.training_parts import ALGORITHMS, H, from_step, make_actor, make_config, make_env, make_training
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.io.files import exclusive
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
 pytest.importorskip("tqdm")
@@ -16,9 +17,22 @@ def test_a_state_of_something_else_is_refused(tmp_path):
         "config": {"gamma": 0.5},
         "prior": {"actor": make_actor(PastPrior(H, sigma=0.25))},
         "policy": {"actor": make_actor(seed=1)},
+        "sampling": {"actor": make_actor().replace(clip=0.5)},
     }.items():
         with raises(ValueError, part):
             make_training(tmp_path, **{"environment_steps": 30, **options})
+    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")}
+
+
+def test_a_second_training_in_a_folder_waits_its_turn_and_loses_nothing(tmp_path):
+    early = make_training(tmp_path, environment_steps=60)  # before the first has saved anything
+    first = make_training(tmp_path, environment_steps=60)
+    with exclusive(tmp_path), raises(BlockingIOError, "in use"):
+        first.run()
+    curve = first.run()
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")}
+    assert early.run() == curve and early.steps == first.steps
+    assert (early.buffer[:] == first.buffer[:]).all()
     assert files == {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")}
 
 

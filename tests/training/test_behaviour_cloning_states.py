@@ -9,6 +9,7 @@ from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, finished, run_until, training, weights
 from warmprior import VelocityMLP
 from warmprior.training import load_policy
+from warmprior.training.checkpoint import load_state, save_state
 
 
 def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):
@@ -26,6 +27,26 @@ def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):
     content[-40_000] ^= 4
     path.write_bytes(content)
     with raises(ValueError, "state.safetensors"):
+        training(tmp_path)
+
+
+def test_a_finished_policy_gets_the_sampling_that_is_asked_for(tmp_path):
+    first = finished(tmp_path)
+    kept = load_policy(first.policy_path())
+    again = training(tmp_path, actor=actor_for().replace(nfe=8, temperature=0.5, solver="heun"))
+    again.step = lambda: pytest.fail("trains again")
+    again.run(None)
+    policy = load_policy(again.policy_path())
+    assert policy.sampling == again.actor.sampling != kept.sampling
+    assert same(policy.state_dict(), kept.state_dict())
+
+
+def test_a_state_of_another_kind_of_device_is_not_called_damaged(tmp_path):
+    state = finished(tmp_path).state_path
+    tensors, facts = load_state(state)
+    facts["identity"]["device"] = "cuda"
+    save_state(state, tensors, facts)
+    with raises(ValueError, "another device", "cuda"):
         training(tmp_path)
 
 

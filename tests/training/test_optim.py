@@ -20,12 +20,14 @@ def test_group_values_are_the_paper_s():
     assert sum(sizes) == sum(p.numel() for p in network.parameters())
 
 
-@pytest.mark.parametrize(("iterations", "ratio"), [(10, 0.2), (100, 0.0), (7, 0.5), (1, 0.2), (3, 0.1)])
+@pytest.mark.parametrize(
+    ("iterations", "ratio"), [(10, 0.2), (100, 0.0), (7, 0.5), (1, 0.2), (3, 0.1), (9, 0.99)]
+)
 def test_schedule_in_closed_form(iterations, ratio):
     parameter = torch.zeros(1, requires_grad=True)
     optimizer = torch.optim.SGD([parameter], lr=2.0)
     schedule = warmup_cosine(optimizer, iterations, ratio)
-    warmup = round(iterations * ratio)
+    warmup = min(round(iterations * ratio), iterations - 1)  # one step at least is no warm-up
     for step in range(iterations):
         if step < warmup:
             expected = 2.0 * (step + 1) / warmup

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -96,8 +97,9 @@ class _Trunk(nn.Module):
         self.net = nn.Sequential(*layers, nn.Linear(hidden_dim, out_features))
 
     def forward(self, *inputs: Tensor) -> Tensor:
+        dtype = cast(nn.Linear, self.net[-1]).weight.dtype  # observations may be doubles
         scaled = zip(inputs, self.scales, strict=True)
-        x = torch.cat([value.flatten(-2) * scale for value, scale in scaled], dim=-1)
+        x = torch.cat([value.flatten(-2).to(dtype) * scale for value, scale in scaled], dim=-1)
         if x.shape[-1] != self.in_features:
             raise ValueError(
                 f"the network was built for {self.in_features} inputs, got the shapes "

@@ -13,17 +13,25 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.checks import check_finite, check_keys
+from warmprior.io.files import exclusive
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
-from warmprior.training.checkpoint import as_key, check_identity, digest_of_state, load_state, save_state
+from warmprior.training.checkpoint import (
+    as_key,
+    check_identity,
+    digest_of_state,
+    load_newer,
+    load_state,
+    save_state,
+)
 from warmprior.training.evaluation import evaluate
 from warmprior.training.parallel import watched
 
@@ -150,11 +158,12 @@ class PriorSpaceTraining:
         self.identity = {
             "config": asdict(config),
             "prior": actor.prior.config(),
+            "sampling": asdict(actor.sampling),
             "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
             "transitions": self._keys,
         }
-        if self.state_path.exists():
-            self._restore()
+        self._restored: float | None = None  # the time at which the restored state was written
+        self._restore()
 
     @property
     def state_path(self) -> Path:
@@ -170,15 +179,21 @@ class PriorSpaceTraining:
 
         Raises:
             KeyError: if the environment has no anchor.
-            ValueError: if the environment does not fit the policy, or executes fewer than ``H`` actions of a
-                chunk.
+            ValueError: if the environment does not fit the policy, executes fewer than ``H`` actions of a
+                chunk, or has an observation of several entries.
             FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
                 the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
+            BlockingIOError: if another process is training in the folder.
         """
+        if self.steps < self.config.environment_steps:
+            with exclusive(self.directory):
+                self._restore()  # another process may have trained since this object was built
+                self._run()
+        return self.curve
+
+    def _run(self) -> None:
         config = self.config
-        if self.steps >= config.environment_steps:
-            return self.curve
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
@@ -191,7 +206,14 @@ class PriorSpaceTraining:
             ) as bar,
         ):
             self.decoder.check_env(evaluation_env)
-            check_keys(evaluation_env.observation_spec, [keys.ANCHOR], "an agent", ": append PriorAnchor")
+            observations = evaluation_env.observation_spec
+            check_keys(observations, [keys.ANCHOR], "an agent", ": append PriorAnchor")
+            key = self.decoder.observation_key
+            if isinstance(observations.get(key), Composite):
+                raise ValueError(
+                    f"agents read vectors, and {key!r} has several entries: append EncodeObservation(actor), "
+                    "and train around actor.replace(observation_key=keys.FEATURES)"
+                )
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()
@@ -210,7 +232,6 @@ class PriorSpaceTraining:
                     policy = self.agent.policy
                     self._evaluate(evaluation_env, {"greedy": policy, "stochastic": policy})
                     self._save()
-        return self.curve
 
     @contextmanager
     def _environment(self, seed: int) -> Iterator[EnvBase]:
@@ -322,12 +343,18 @@ class PriorSpaceTraining:
             "segments": self.segments.committed,
         }
         save_state(self.state_path, tensors, facts)
+        self._restored = self.state_path.stat().st_mtime
 
     def _restore(self) -> None:
-        tensors, facts = load_state(self.state_path)
+        """Continue from the folder's state, if it has one that is not restored already."""
+        newer = load_newer(self.state_path, self._restored)
+        if newer is None:
+            return
+        self._restored, tensors, facts = newer
         check_identity(self.state_path, facts["identity"], self.identity)
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
+        self.buffer.empty()
         if transitions is not None:
             self.buffer.extend(transitions)
         self.agent.load(tensors)

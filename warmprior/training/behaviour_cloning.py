@@ -24,7 +24,7 @@ from warmprior.training.checkpoint import (
     check_identity,
     data_digest,
     fixed_identity,
-    load_state,
+    load_newer,
     named,
     part_identity,
     restore_rng,
@@ -36,7 +36,7 @@ from warmprior.training.checkpoint import (
 from warmprior.training.gradient_step import GradientStep
 from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
-from warmprior.training.saved import check_saveable, load_policy, save_policy
+from warmprior.training.saved import check_saveable, load_policy, policy_config, save_policy
 from warmprior.transforms.window import window_replay_buffer
 
 WINDOWS_SEED = 1_000_003
@@ -141,17 +141,18 @@ class BehaviourCloning:
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
             "config": asdict(config) | {"weighting": self.update.loss_module.weighting},
+            "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "prior": part_identity(actor.prior),
             "start": part_identity(actor.start),
             "coupling": part_identity(coupling),
             "network": part_identity(actor.network),
-            "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {
                 "observation_steps": observation_steps,
                 "clip": actor.sampling.clip,
                 "max_nfe": actor.sampling.max_nfe,
                 "normalizer": fixed_identity(actor.normalizer),  # data in other units may be equal
             },
+            "device": self.generator.device.type,  # a generator's state is of one kind of device
             "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)
@@ -239,13 +240,14 @@ class BehaviourCloning:
         save_policy(self.update.averaged(self.actor), self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
-        """Return True if the policy of this iteration is on disk and complete."""
+        """Return True if the policy of this iteration is on disk, complete, and acts as this run's does."""
         try:
             with torch.random.fork_rng([]):  # loading a policy first draws random weights
-                load_policy(self.policy_path(self.iteration))
+                kept = policy_config(load_policy(self.policy_path(self.iteration)))
         except (OSError, ValueError):
             return False
-        return True
+        asked = policy_config(self.actor)
+        return all(kept[part] == asked[part] for part in ("actor", "environment"))
 
     def _check_finite(self) -> None:
         # Checked before every save, and not only before logs: a run cannot resume from a saved NaN.
@@ -301,12 +303,10 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        if not self.state_path.exists():
+        newer = load_newer(self.state_path, self._restored)
+        if newer is None:
             return
-        written = self.state_path.stat().st_mtime
-        if written == self._restored:
-            return
-        tensors, facts = load_state(self.state_path)
+        written, tensors, facts = newer
         check_identity(self.state_path, facts.get("identity"), self.identity)
         with restoring(self.state_path):
             self._load(tensors, facts)

@@ -43,6 +43,13 @@ def load_state(
     return tensors, facts
 
 
+def load_newer(path: Path, known: float | None) -> tuple[float, dict[str, Tensor], dict[str, Any]] | None:
+    """Read a state, and when it was written; None if there is none, or it was written at the known time."""
+    if not path.exists() or (written := path.stat().st_mtime) == known:
+        return None
+    return written, *load_state(path)
+
+
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
     """Return the SHA-256 of a state's content."""
     digest = hashlib.sha256(json.dumps(facts).encode())

@@ -47,7 +47,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
     """
     check_whole_numbers(iterations=iterations)
     check_share(warmup_ratio=warmup_ratio)
-    warmup = round(iterations * warmup_ratio)
+    warmup = min(round(iterations * warmup_ratio), iterations - 1)
 
     def factor(step: int) -> float:
         if step < warmup:
