@@ -5,7 +5,9 @@ pytest.importorskip("gymnasium")
 
 import gymnasium
 import numpy as np
+from torchrl.envs import SerialEnv
 
+from tests.errors import raises
 from warmprior.envs.gymnasium import gym_env
 
 
@@ -67,6 +69,27 @@ def test_episodes_are_those_of_the_bare_environment(seed):
     assert heights == pytest.approx([height for *_, height in expected])
     # The flag of a reset is there as well; both kinds occur.
     assert any(solved) and not all(solved)
+
+
+class Signs(Dial):
+    """A dial that shows flags, a whole number and a choice."""
+
+    def __init__(self):
+        super().__init__()
+        spaces = gymnasium.spaces
+        parts = {"flags": spaces.MultiBinary(2), "grey": spaces.Box(0, 255, (1,), np.uint8)}
+        self.observation_space = spaces.Dict(parts | {"choice": spaces.Discrete(3)})
+
+    def _seen(self):
+        return {"flags": np.array([1, 0], np.int8), "grey": np.array([200], np.uint8), "choice": 2}
+
+
+def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
+    env = gym_env(Signs(), observation_keys=["grey", "flags"])
+    assert env.observation_spec["observation"].dtype == torch.float32
+    assert SerialEnv(2, lambda: env).rollout(2)["observation"][1, 1].tolist() == [200.0, 1.0, 0.0]
+    with raises(ValueError, "'choice'", "FlattenObservation"):
+        gym_env(Signs())
 
 
 def test_every_seed_is_one_reset_and_later_episodes_are_others():

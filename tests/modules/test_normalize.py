@@ -1,6 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Bounded
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -80,6 +81,32 @@ def test_environment_side_equals_data_side(batched):
         normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 2:],
         normalizer.denormalize(normalized)["action"],
     )
+
+
+class Whole(CountingEnv):
+    """The toy with an observation of whole numbers, or of flags."""
+
+    def __init__(self, dtype):
+        super().__init__(5)
+        self.observation_spec["observation"] = Bounded(0, 9, (2,), dtype=dtype)
+
+    def _seen(self, out):
+        seen = out["observation"][:2].to(self.observation_spec["observation"].dtype)
+        return super()._seen(out).set("observation", seen)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool])
+def test_whole_numbers_and_flags_become_floats_in_a_batch_too(dtype):
+    normalizer = Normalizer({"observation": torch.zeros(2)}, {"observation": torch.full((2,), 9.0)})
+
+    def make():
+        return TransformedEnv(Whole(dtype), Compose(*normalizer.env_transforms()))
+
+    raw = Whole(dtype).rollout(3)
+    expected = normalizer.normalize(raw)["observation"]
+    for env in (make(), SerialEnv(1, make)):
+        assert env.observation_spec["observation"].dtype == torch.float32
+        assert torch.equal(env.rollout(3)["observation"].reshape(-1, 2), expected)
 
 
 def test_errors():

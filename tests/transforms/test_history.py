@@ -133,6 +133,8 @@ def test_the_last_actions_are_part_of_the_observation():
             assert torch.equal(seen[decision, i], torch.cat([own[decision, i], added]))
     data = TensorDict({"observation": own, "history": history}, [5])
     assert torch.equal(HistoryObservation()(data)[keys.CONDITIONED], seen)
+    whole = data.set("observation", own.long())  # whole numbers do not cut the actions
+    assert torch.equal(HistoryObservation()(whole)[keys.CONDITIONED][..., 4:], seen[..., 4:])
 
 
 def test_keys_that_it_lacks_are_named():

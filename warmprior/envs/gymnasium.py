@@ -11,7 +11,15 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import CatTensors, Compose, DoubleToFloat, GymWrapper, RenameTransform, TransformedEnv
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    DTypeCastTransform,
+    GymWrapper,
+    RenameTransform,
+    TransformedEnv,
+)
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from warmprior.envs.rendering import rendering_backend
@@ -78,6 +86,7 @@ def gym_env(
 
     Raises:
         KeyError: if an entry does not exist.
+        ValueError: if an observation is not a vector, such as a discrete one.
 
     Examples:
         >>> import gymnasium
@@ -87,8 +96,8 @@ def gym_env(
         (torch.Size([3]), False)
     """
     base = _Gym(env, categorical_action_encoding=True)
-    names = base.observation_spec.keys(True, True)
-    present = {key if isinstance(key, str) else "/".join(key): key for key in names}
+    every = base.observation_spec.keys(True, True)
+    present = {key if isinstance(key, str) else "/".join(key): key for key in every}
     chosen = list(observation_keys) or list(present)
     if missing := [key for key in chosen if key not in present]:
         raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
@@ -97,7 +106,17 @@ def gym_env(
     if dtypes:
         base.set_info_dict_reader(_Infos(dtypes))
     base.ends_at = success if terminate_on_success else None
+    specs = {key: base.observation_spec[present[key]] for key in chosen}
+    if others := [k for k, spec in specs.items() if spec.ndim != 1 and (spec.ndim == 0 or len(specs) > 1)]:
+        raise ValueError(
+            f"the observations {others} are no vectors: leave them out of observation_keys, or wrap the "
+            "environment in gymnasium.wrappers.FlattenObservation"
+        )
+    integers = {k: spec for k, spec in specs.items() if spec.ndim == 1 and not spec.dtype.is_floating_point}
     transforms = [DoubleToFloat()]
+    for dtype in {spec.dtype for spec in integers.values()}:
+        names = [present[key] for key, spec in integers.items() if spec.dtype == dtype]
+        transforms.append(DTypeCastTransform(dtype, torch.float32, in_keys=names))
     if chosen != [OBSERVATION]:
         transforms.append(CatTensors([present[key] for key in chosen], OBSERVATION, sort=False))
     return TransformedEnv(base, Compose(*transforms))

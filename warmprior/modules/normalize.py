@@ -9,10 +9,26 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
 from warmprior.checks import check_keys, check_shape
+
+
+class _FloatNorm(ObservationNorm):
+    """TorchRL's transform, for integers and flags too: its specs would keep their type, and buffers cut."""
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return super()._apply_transform(obs if obs.is_floating_point() else obs.to(self.loc.dtype))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Set the spec of what is normalised, which is floating point."""
+        for key in self.in_keys:
+            leaf = observation_spec.get(key)
+            if leaf is not None and not leaf.dtype.is_floating_point:
+                observation_spec[key] = Unbounded(leaf.shape, dtype=self.loc.dtype, device=leaf.device)
+        return super().transform_observation_spec(observation_spec)
 
 
 class Normalizer(nn.Module):
@@ -133,7 +149,7 @@ class Normalizer(nn.Module):
             if key == action_key:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
-                transforms.append(ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
+                transforms.append(_FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
         return transforms
 
     def config(self) -> dict[str, Any]:

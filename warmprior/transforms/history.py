@@ -202,8 +202,9 @@ class HistoryObservation(EnvTransform):
         context = torch.cat([flat, full.to(flat)], dim=-1).unsqueeze(-2)
 
         def extend(vector: Tensor) -> Tensor:
-            added = context.expand(*vector.shape[:-1], context.shape[-1]).to(vector.dtype)
-            return torch.cat([vector, added], dim=-1)
+            dtype = vector.dtype if vector.is_floating_point() else context.dtype
+            added = context.expand(*vector.shape[:-1], context.shape[-1])
+            return torch.cat([vector.to(dtype), added.to(dtype)], dim=-1)
 
         return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
 
@@ -224,7 +225,8 @@ class HistoryObservation(EnvTransform):
 
         def extend(vector: Unbounded) -> Unbounded:
             shape = (*vector.shape[:-1], vector.shape[-1] + self.width(*actions.shape[-2:]))
-            return Unbounded(shape, dtype=vector.dtype, device=vector.device)
+            dtype = vector.dtype if vector.dtype.is_floating_point else actions.dtype
+            return Unbounded(shape, dtype=dtype, device=vector.device)
 
         observation_spec[self.out_keys[0]] = _with_vector(observation, extend)
         return observation_spec
