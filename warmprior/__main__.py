@@ -197,6 +197,8 @@ def train(args: argparse.Namespace) -> None:
     """Train a policy on demonstrations, without playing episodes."""
     import tyro
 
+    from warmprior.envs.description import is_registered
+
     place, *rest = args.options or [""]
     if not place or place.startswith("-"):
         place, rest = "", args.options
@@ -213,7 +215,12 @@ def train(args: argparse.Namespace) -> None:
         )
     chosen, steps = asdict(options.data), options.network.observation_steps
     whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
-    if whole.environment is not None:
+    recorded: Any = whole.environment
+    playable = recorded is not None
+    if is_registered(recorded) and recorded["gymnasium"]["success"] is None:
+        print("its environment does not say when the task is solved, so the policy is only trained")
+        playable = False
+    elif playable:
         try:
             whole.check_environment()  # an error is better raised before the training
         except ImportError as missing:
@@ -244,7 +251,7 @@ def train(args: argparse.Namespace) -> None:
         )
         for nfe, error in errors_of(actor, left_out, steps, (1, 3, 9, options.nfe)).items():
             print(f"  NFE {nfe}: {error:.4f}")
-    if whole.environment is not None:
+    if playable:
         print(f"to play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
     print(saved)
 

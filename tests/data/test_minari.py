@@ -49,7 +49,7 @@ def drawn(space, rng, length):
     return rng.uniform(-1, 1, (length, *space.shape)).astype(space.dtype)
 
 
-def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, **options):
+def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, success=True, **options):
     rng = np.random.default_rng(0)
     buffers = [
         EpisodeBuffer(
@@ -59,7 +59,7 @@ def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, **optio
             rewards=rng.uniform(size=n).tolist(),
             terminations=[False] * n,
             truncations=[False] * (n - 1) + [True],
-            infos={"success": np.arange(n) > n - 2},
+            infos={"success": np.arange(n) > n - 2} if success else {},
         )
         for i, n in enumerate(LENGTHS)
     ]
@@ -143,6 +143,15 @@ def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
     task = Task.open(place)
     with raises(ValueError, "environment"):
         task.make_env()
+
+
+def test_an_environment_that_reports_no_success_is_trained_for(tmp_path, capsys):
+    space = Box(-np.inf, np.inf, (3,), np.float32)
+    name = written(observation=space, success=False, env="Pendulum-v1", expert_policy=None)
+    small = ["--iterations", "2", "--hidden-dim", "8", "--out", str(tmp_path)]
+    assert not main(["train", f"minari:{name}", *small])
+    said = capsys.readouterr().out
+    assert "only trained" in said and "to play it" not in said
 
 
 def test_nothing_named_in_a_dataset_is_imported(root):

@@ -1,7 +1,9 @@
 import math
+import shutil
 import sys
 from types import ModuleType
 
+import h5py
 import pytest
 import torch
 from tensordict import TensorDict
@@ -196,6 +198,24 @@ def test_data_that_cannot_be_are_named():
         task = Task.of("own", steps(**fitting | changed), NavigationEnv)
         with raises(ValueError, "own human", f"'{next(iter(changed))}'"):
             task.check_environment()
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"actions": "absolute", "horizon": 9}, "actions, horizon"),
+        ({"fast_rendering": True, "make_env": NavigationEnv}, "fast_rendering"),
+        ({"success": "solved"}, "make_env"),
+    ],
+)
+def test_an_option_that_cannot_be_applied_is_refused(path, tmp_path, options, named):
+    place = path
+    if "actions" in options:  # a robot's file
+        place = shutil.copy(path, tmp_path / "robot.hdf5")
+        with h5py.File(place, "a") as file:
+            del file["data"].attrs["env_args"]
+    with raises(ValueError, named):
+        Task.open(place, **options)
 
 
 def test_part_of_a_file_is_its_first_demonstrations(path):

@@ -173,7 +173,9 @@ class Task:
         mask: str | None = None,
         demos: int | None = None,
         horizon: int | None = None,
-        **outcome: Any,
+        success: NestedKey | None = None,
+        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        video_rate: int | None = None,
     ) -> Self:
         """Build a task from a file or dataset, with the environment that recorded it if that is known.
 
@@ -198,12 +200,15 @@ class Task:
             mask: a mask of the file, such as ``"train"``.
             demos: number of demonstrations to take, from the first on; all by default.
             horizon: control steps per episode; by default the environment's own, or that of the style.
-            **outcome: ``success``, ``measures`` and ``video_rate``, only with a ``make_env``, see :meth:`of`.
+            success: see :meth:`of`; only with a ``make_env``, like the next two.
+            measures: see :meth:`of`.
+            video_rate: see :meth:`of`.
 
         Raises:
             FileNotFoundError: if there is no such file or dataset.
             DatasetError: if the data are invalid, or their images differ from the simulator's.
-            ValueError: if the file holds another task, or its actions are not near ``joint_key``.
+            ValueError: if the file holds another task, its actions are not near ``joint_key``, or an option
+                is for another environment.
 
         Examples:
             >>> from warmprior.training import Task
@@ -218,10 +223,27 @@ class Task:
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.training import files
 
+        outcome: dict[str, Any] = {"success": success, "measures": measures, "video_rate": video_rate}
+        outcome = {name: value for name, value in outcome.items() if value is not None}
+        if outcome and make_env is None:
+            raise ValueError(f"{', '.join(outcome)} of an environment of your own: pass its make_env as well")
         demonstrations = files.opened(place, task, mask)
         image_keys = demonstrations.image_keys(image_keys)
         index = demonstrations.index(observation_keys=observation_keys)
         if make_env is not None or not index.env_args:
+            environment = None if make_env is not None or image_keys else demonstrations.environment()
+            others = {
+                "actions": actions != "delta",
+                "fast_rendering": fast_rendering,
+                "task": task is not None and not index.env_args,
+                "horizon": horizon is not None and environment is None,
+            }
+            if unused := [name for name, given in others.items() if given]:
+                known = "the demonstrations name none" if make_env is None else "make_env replaces it"
+                raise ValueError(
+                    f"{place}: {', '.join(unused)} would change a recorded environment, but {known}: leave "
+                    "out what cannot be applied"
+                )
             storage = "memmap" if image_keys else "memory"
             chosen: dict[str, Any] = {"observation_keys": observation_keys, "image_keys": image_keys}
             replay = demonstrations.replay(demos=demos, storage=storage, **chosen)
@@ -229,7 +251,6 @@ class Task:
             if joint_key is not None:
                 opened = opened.with_joints(replay.joint_columns(joint_key))
             facts: dict[str, Any] = opened.facts | {"source": "file", "file": demonstrations.name}
-            environment = None if make_env is not None or image_keys else demonstrations.environment()
             if environment is None:
                 return replace(opened, facts=facts)
             environment |= {"observation_keys": list(index.observation_keys)}
