@@ -316,6 +316,7 @@ def test_chunks_that_no_robot_should_get():
             ({"delay": float("nan"), "control_rate": 20}, ("delay",)),
         ),
         ({"delay": 0.06, "control_rate": 0}, ("control_rate", 0)),
+        *(({"delay": float("inf")}, ("delay",)), ({"timeout": "0.1"}, ("timeout",))),
         ({"delay": 1.0, "control_rate": 50}, ("delay", 50)),
     ],
 )

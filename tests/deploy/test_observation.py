@@ -112,6 +112,18 @@ def test_a_vector_may_be_the_state_among_others():
         one.act({"front_image": pictures(8, 8)})
 
 
+def test_a_normaliser_without_the_observation_and_whole_numbers():
+    policy = sighted()
+    for lacking in ({"action": torch.ones(2)}, {"action": torch.ones(2), "observation": torch.ones(3)}):
+        normalizer = Normalizer(lacking, {key: 2 * value for key, value in lacking.items()})
+        with raises(ValueError, "'state'"):
+            AsyncExecutor(policy, latency=0, normalizer=normalizer)
+    found = seen_by(policy := sighted().replace(normalizer=None))
+    with AsyncExecutor(policy, latency=0) as executor:
+        executor.act({"state": np.array([1, 0, 1]), **pictures(16, 16)})
+    assert found[0]["state"].tolist() == [[1.0, 0.0, 1.0]] * 2
+
+
 def test_drivers_reuse_their_memory():
     policy, memory = Scripted(8), np.zeros(1)
     with AsyncExecutor(policy, prior=PastPrior(8), action_dim=2, latency=0, execute=1) as executor:

@@ -1,5 +1,8 @@
 """A LeRobot policy in TorchRL's environments, and frozen under an agent."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -14,8 +17,9 @@ from tests.toy_env import CountingEnv
 from warmprior import PastPrior, PreviewPrior, policy_transforms
 from warmprior.deploy import AsyncExecutor
 from warmprior.diagnostics import executed_actions
-from warmprior.history import window_history
+from warmprior.history import cold_history, window_history
 from warmprior.lerobot import LeRobotActor
+from warmprior.lerobot.actor import entry_names
 from warmprior.rl import PriorDecoder
 
 
@@ -58,8 +62,8 @@ def history_of(actions):
 
 
 def actor_of(made, prior, **options):
-    generator = torch.Generator().manual_seed(0)
-    return LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed, generator=generator, **options)
+    options = {"generator": torch.Generator().manual_seed(0)} | options
+    return LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed, **options)
 
 
 @pytest.mark.parametrize("family", ["smolvla", "xvla"])
@@ -154,3 +158,27 @@ def test_an_executor_runs_it_as_an_environment_does(policy, prior):
             actions.append(executor.act(data["observation"]))
             data = arm.step(data.set("action", actions[-1]))["next"]
     torch.testing.assert_close(torch.stack(actions), expected)
+
+
+def test_decisions_of_several_threads_take_turns(policy):
+    made = policy("smolvla")
+    actors = [actor_of(made, PastPrior(LENGTH), nfe=1, generator=None) for _ in range(2)]
+    history = cold_history([1], LENGTH, LENGTH, ACTION)
+    data = TensorDict({"observation": Arm().reset()["observation"][None, None], "history": history}, [1])
+    with ThreadPoolExecutor(4) as pool:
+        chunks = [pool.submit(actors[i % 2], data.clone()) for i in range(40)]
+    assert all(chunk.result()["vla_action", "chunk"].isfinite().all() for chunk in chunks)
+    assert "sample_actions" not in vars(made.model)  # the sampler is the policy's own again
+
+
+def test_names_of_cameras_that_end_alike_or_do_not_exist():
+    images = [f"observation.images.{name}" for name in ("left.rgb", "right.rgb", "top", "empty_camera_0")]
+    names = entry_names(["observation.state", *images])
+    assert list(names) == ["state", "left.rgb", "right.rgb", "top"]
+    assert list(names.values()) == ["observation.state", *images[:3]]
+
+
+def test_a_generator_does_not_go_to_worker_processes(policy, monkeypatch):
+    monkeypatch.setattr("warmprior.modules.actor.get_spawning_popen", lambda: object())
+    with raises(RuntimeError, "same noise"):
+        pickle.dumps(actor_of(policy("smolvla"), PastPrior(LENGTH)))

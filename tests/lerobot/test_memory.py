@@ -1,5 +1,7 @@
+import pytest
 import torch
 
+from tests.errors import raises
 from warmprior import PreviewPrior
 from warmprior.history import ENTRIES
 from warmprior.lerobot.memory import ActionMemory
@@ -53,6 +55,15 @@ def test_an_episode_that_begins_inside_a_chunk():
     memory.record(chunk(21, 8))
     memory.step()
     assert row(memory.decide(2)) == [[0, -5, 3, 21], [3], [22, 23, 24, 25, 26, 27, 28, 0], [7]]
+
+
+@pytest.mark.parametrize("steps", [1.5, torch.tensor([1.0, 2.5]), torch.tensor([1, 1, 1])])
+def test_counts_and_corrections_that_cannot_be(steps):
+    memory = executing(PreviewPrior(3), 1)
+    with raises(ValueError, "executed_steps"):
+        memory.executed(steps)
+    with raises(ValueError, "the executed action"):
+        memory.correct(torch.zeros(2, 2))
 
 
 def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():

@@ -316,6 +316,7 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
             *(({"clip": None}, "clip=1.0"), ({"observation_key": keys.CONDITIONED}, "last actions")),
             *(({"solver": "midpoint", "nfe": 4}, "Euler"), ({"grid": "dense-jump"}, "uniform")),
             *(({"guidance": RealTimeChunking()}, "guidance"), ({"start": Halfway()}, "Euler")),
+            *(({"temperature": 0.5}, "'temperature': 0.5"), ({"max_nfe": 1, "nfe": 1}, "max_nfe")),
         ]
     ):
         saved_policy(tmp_path / f"other{i}", **options)
@@ -334,6 +335,7 @@ def test_the_environment_has_the_observations_of_converted_demonstrations():
 
     config = RobosuiteEnvConfig(task="lift", episode_length=5)
     ((batch,),) = (suite.values() for suite in config.create_envs(2).values())
+    assert not np.array_equal(*batch.reset()[0]["environment_state"])  # without a seed
     single = batch.envs[0]
     check_env(single, skip_render_check=True)
     observation, _ = batch.reset(seed=[3, 4])

@@ -4,7 +4,8 @@ from tensordict import TensorDict
 
 from lab.tasks import navigation_task
 from tests.errors import raises
-from warmprior import ChiTransformer, PastPrior
+from warmprior import ChiTransformer, HistoryObservation, PastPrior
+from warmprior.deploy import AsyncExecutor
 from warmprior.modules import PreconditionedNetwork
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.train import new_policy
@@ -74,3 +75,16 @@ def test_a_fresh_policy_has_the_parts_that_were_asked_for():
     assert isinstance(made.network, PreconditionedNetwork) and made.sampling.max_nfe == 1
     width = task.vector.shape[-1]
     assert made.network.observation_dim > first.network.observation_dim == width
+
+
+class Long(PastPrior):
+    history_length = 7
+
+
+def test_networks_see_all_that_a_prior_remembers():
+    options = {"network": NETWORK, "training": CONFIG, "see_history": True, "nfe": 1, "description": None}
+    policy = train_policy(task := navigation_task(), Long(4), **options)
+    width = task.vector.shape[-1]
+    assert policy.network.observation_dim == width + HistoryObservation.width(7, 1)
+    with AsyncExecutor(policy, latency=0) as executor:
+        assert executor.act(torch.zeros(width)).shape == (1,)

@@ -23,9 +23,11 @@ from warmprior.checks import (
     check_between,
     check_finite,
     check_finite_numbers,
+    check_not_negative,
     check_positive,
     check_shape,
     check_whole_numbers,
+    given,
 )
 from warmprior.deploy.observation import RobotObservation, observation_shapes
 from warmprior.history import caught_up, cold_history
@@ -123,6 +125,7 @@ class AsyncExecutor:
         if latency is not None and pool is not None:
             raise ValueError("a simulated latency computes in the calling thread: leave out pool")
         check_whole_numbers(window=window, observation_steps=observation_steps)
+        check_not_negative(**given(timeout=timeout))
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
         if execute is None:
@@ -331,6 +334,7 @@ def _steps(delay: float | None, control_rate: float | None) -> int:
     """Return a delay in control steps, converted from seconds if the rate is given."""
     if delay is None:
         return 1
+    check_finite_numbers(delay=delay)
     if control_rate is None:
         if delay != int(delay):
             raise ValueError(
@@ -338,5 +342,4 @@ def _steps(delay: float | None, control_rate: float | None) -> int:
             )
         return int(delay)
     check_positive(control_rate=control_rate)
-    check_finite_numbers(delay=delay)
     return math.ceil(round(delay * control_rate, 6))

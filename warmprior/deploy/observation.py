@@ -40,7 +40,7 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
     width = network.observation_dim
     if keys.CONDITIONED in actor.in_keys:
         prior = plain.prior if prior is None else prior
-        width -= HistoryObservation.width(prior.chunk_length, network.action_dim)
+        width -= HistoryObservation.width(prior.history_length, network.action_dim)
     return {keys.STATE: (width,)}
 
 
@@ -50,12 +50,23 @@ class RobotObservation:
     Args:
         shapes: see :func:`observation_shapes`; with ``None`` observations are only copied.
         normalizer: normaliser of vectors.
+
+    Raises:
+        ValueError: if the normaliser lacks a vector.
     """
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]] | None, normalizer: Normalizer | None) -> None:
         self.shapes, self.normalizer = shapes, normalizer
         # A policy with a single vector takes it without a name.
         self._vector = shapes is not None and [len(shape) for shape in shapes.values()] == [1]
+        if normalizer is None or shapes is None:
+            return
+        vectors: list[Any] = [(keys.OBSERVATION, name) for name, shape in shapes.items() if len(shape) == 1]
+        needed = [keys.OBSERVATION] if self._vector else vectors
+        if lacking := [key for key in needed if key not in normalizer.keys]:
+            raise ValueError(
+                f"the normaliser has {normalizer.keys}, but not {lacking}: fit it with these keys"
+            )
 
     def __call__(self, observation: Any) -> Tensor | TensorDictBase:
         """Return the observation of one step, ``[d]`` or a tensordict ``[]``.
@@ -105,7 +116,7 @@ def _fitted(name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
     array = _copied(name, value)
     if len(shape) != 3:
         check_shape(name, array, shape)
-        return array
+        return array if array.is_floating_point() else array.float()
     image = array if array.ndim != 3 or len(array) == 3 else array.movedim(-1, 0)
     if image.dtype != torch.uint8 or image.ndim != 3 or len(image) != 3 or not image.numel():
         raise ValueError(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
+from threading import Lock
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDictBase
@@ -16,9 +19,33 @@ from warmprior.checks import check_shape
 from warmprior.history import history_keys
 from warmprior.lerobot.adapter import WarmPriorAdapter
 from warmprior.lerobot.source import ChunkSource
+from warmprior.modules.actor import check_unshared
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior, noise_factor
+
+_EMPTY = "observation.images.empty_camera_"
+"""The beginning of LeRobot's names of cameras that do not exist, whose images it makes itself."""
+
+_TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()
+"""A lock per policy: decisions take turns, because each replaces the policy's sampler for its duration."""
+
+
+def entry_names(features: Iterable[str]) -> dict[str, str]:
+    """Return LeRobot's name of each entry of the observation, by the last part of that name.
+
+    Where last parts are equal, the entry has all that is behind ``observation.images.``. Cameras that do not
+    exist have none.
+
+    Examples:
+        >>> from warmprior.lerobot.actor import entry_names
+        >>> entry_names(["observation.state", "observation.images.left.rgb", "observation.images.right.rgb"])
+        {'state': 'observation.state', 'left.rgb': 'observation.images.left.rgb', 'right.rgb': ...}
+    """
+    named = [name for name in features if not name.startswith(_EMPTY)]
+    last = Counter(name.rpartition(".")[2] for name in named)
+    whole = {name: name.removeprefix("observation.").removeprefix("images.") for name in named}
+    return {short if last[short := name.rpartition(".")[2]] == 1 else whole[name]: name for name in named}
 
 
 class LeRobotFlow(TensorDictModuleBase):
@@ -48,7 +75,7 @@ class LeRobotFlow(TensorDictModuleBase):
         self._policy = (policy,)
         self.source = self.network = source  # the source has the width of actions
         inputs = policy.config.input_features
-        self.names = {n.rpartition(".")[2]: n for n in inputs} if names is None else dict(names)
+        self.names = entry_names(inputs) if names is None else dict(names)
         self.preprocess = preprocess
         self.seed = seed
         self.in_keys = [keys.NOISE, keys.OBSERVATION]
@@ -85,6 +112,7 @@ class LeRobotFlow(TensorDictModuleBase):
         # This source replaces that of a policy of the plugin.
         own = getattr(self.policy, "warm_adapter", None)
         with (
+            _TURNS.setdefault(self.policy, Lock()),
             nullcontext() if own is None else own.aside(),
             self.source.port.sampling(self.policy, draw, chunks.append, nfe),
         ):
@@ -94,7 +122,8 @@ class LeRobotFlow(TensorDictModuleBase):
 
     def _batch(self, observation: Tensor | TensorDictBase) -> dict[str, Any]:
         if isinstance(observation, Tensor):
-            entries = {"observation.state": observation}
+            vectors = list(self.names.values())
+            entries = {vectors[0] if len(vectors) == 1 else "observation.state": observation}
         else:
             if unnamed := sorted(set(observation.keys()) - set(self.names)):
                 raise ValueError(f"names lacks {unnamed}: give names={{'state': 'observation.state', ...}}")
@@ -130,8 +159,9 @@ class LeRobotActor(TensorDictModuleBase):
         generator: source of randomness, also per call: ``actor(data, generator=...)``.
         names: LeRobot's name of each entry of the observation, such as
             ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; by default the
-            last part of LeRobot's. An observation that is a tensor ``[*B, To, d]`` is ``observation.state``.
-            Images of bytes become floats in [0, 1].
+            last part of LeRobot's, or all behind ``observation.images.`` where last parts are equal. An
+            observation that is a tensor ``[*B, To, d]`` is the only entry, or ``observation.state``. Images
+            of bytes become floats in [0, 1].
         preprocess: converts raw observations to the policy's batch, such as LeRobot's preprocessor; none by
             default.
         postprocess: converts actions ``[1, d_a]`` to those of a robot, such as LeRobot's postprocessor, for
@@ -192,6 +222,10 @@ class LeRobotActor(TensorDictModuleBase):
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *history_keys()]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
+
+    def __getstate__(self) -> Any:
+        check_unshared(self.generator)
+        return super().__getstate__()
 
     @property
     def prior(self) -> Prior:

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import pad
 
-from warmprior.checks import check_between, check_shape
+from warmprior.checks import check_between, check_shape, check_whole_numbers
 from warmprior.history import caught_up, cold_history, without
 from warmprior.modules.prior import Prior
 
@@ -122,7 +122,10 @@ class ActionMemory:
         if self._chunk is None:
             return
         count = torch.as_tensor(steps, device=self._executed.device)
+        if count.ndim:
+            check_shape("executed_steps", count, (len(self._chunk),))
         for number in count.flatten().tolist():
+            check_whole_numbers(0, executed_steps=number)
             check_between(0, self.prior.prediction_length, executed_steps=number)
         counted = self._new[:, None] & (count.ndim == 0)
         self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
@@ -132,6 +135,7 @@ class ActionMemory:
         """Replace the action executed last, ``[B, d_a]``; raise ValueError if there is none."""
         if self._chunk is None or not self._executed.all():
             raise ValueError("no action was executed since the last decision: there is nothing to correct")
+        check_shape("the executed action", action, (len(self._chunk), self.action_dim))
         last = (self._executed - 1)[..., None].expand(-1, 1, self.action_dim)
         self._chunk = self._chunk.scatter(1, last, action.to(self._chunk)[:, None])
 

@@ -23,6 +23,15 @@ from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
 
 
+def check_unshared(generator: torch.Generator | None) -> None:
+    """Raise RuntimeError if a policy with a generator is on its way to a worker process."""
+    if generator is not None and get_spawning_popen() is not None:
+        raise RuntimeError(  # TorchRL's collectors swallow a TypeError
+            "a policy with a generator cannot go to worker processes: all of them would draw the same noise. "
+            "Build it without one (generator=None), and seed the collector with set_seed"
+        )
+
+
 class StartPoint(Registered, nn.Module):
     """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
@@ -107,12 +116,7 @@ class PriorSampler(TensorDictModuleBase):
         self.out_keys = [unravel_key((source_key, name)) for name in ("loc", "warm", "noise")]
 
     def __getstate__(self) -> Any:
-        if self.generator is not None and get_spawning_popen() is not None:
-            raise RuntimeError(  # TorchRL's collectors swallow a TypeError
-                "a policy with a generator cannot go to worker processes: all of them would draw the same "
-                "noise. Build it without one (actor.replace(generator=None)), and seed the collector with "
-                "set_seed"
-            )
+        check_unshared(self.generator)
         return super().__getstate__()
 
     def source(self, tensordict: TensorDictBase) -> Source:

@@ -47,7 +47,7 @@ def new_policy(
     """Return a policy with fresh weights, which depend only on the seed; see :func:`train_policy`."""
     action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
     if see_history:
-        observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
+        observation_dim += HistoryObservation.width(prior.history_length, action_dim)
     torch.manual_seed(training.seed)
     velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images)
     if network.precondition:

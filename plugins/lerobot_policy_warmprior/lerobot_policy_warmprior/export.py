@@ -46,7 +46,8 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     actor = load_policy(folder)
     described = actor.environment or {}
     sees_history = actor.sees_history
-    if sees_history or "images" in described or "actions" in described:
+    sees_images = cast(VelocityNetwork, actor.network).encodes
+    if sees_history or sees_images or "actions" in described:
         raise ValueError(
             f"{folder}: policies with images, absolute actions or observed last actions need transforms that "
             "LeRobot does not have: export a policy with states and pose deltas"
@@ -56,12 +57,14 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
             f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
             f"{actor.sampling.clip}), because warm_flow has both"
         )
-    sampler = actor.sampling.solver, actor.sampling.grid, actor.ode.guidance, actor.start
-    if sampler != ("euler", "uniform", None, None):
+    usual = {"solver": "euler", "grid": "uniform", "max_nfe": None, "temperature": None}
+    usual |= {"guidance": None, "start": None}
+    own = {**vars(actor.sampling), "guidance": actor.ode.guidance, "start": actor.start}
+    if others := {name: own[name] for name, value in usual.items() if own[name] != value}:
         raise ValueError(
-            f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, from the "
-            f"source, and the policy has (solver, grid, guidance, start)={sampler}: change it first, as with "
-            "actor.replace(solver='euler', grid='uniform', guidance=None, start=None), and save it"
+            f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, from a "
+            f"draw of the source, and has no max_nfe, but the policy has {others}: change it first, with "
+            "actor.replace, and save it"
         )
     prior, network, normalizer = actor.prior, cast(VelocityNetwork, actor.network), actor.normalizer
     assert normalizer is not None

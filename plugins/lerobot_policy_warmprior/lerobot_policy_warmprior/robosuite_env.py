@@ -45,6 +45,7 @@ class RobosuiteGymEnv(gymnasium.Env):
         self._object_dim, self._cameras = spec.object_dim, list(cameras)
         self._max_episode_steps = spec.horizon(style) if horizon is None else horizon
         self.render_mode = render_mode
+        self._begun = False
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
 
         def box(width: int) -> gymnasium.spaces.Box:
@@ -61,10 +62,12 @@ class RobosuiteGymEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed, or the next one."""
+        """Start the episode of a seed, or the next one; without any seed the first is drawn."""
         super().reset(seed=seed)
-        if seed is not None:
-            self._env.set_seed(seed, static_seed=True)
+        if seed is not None or not self._begun:  # else every environment would play the episodes of seed 0
+            drawn = int(self.np_random.integers(2**31)) if seed is None else seed
+            self._env.set_seed(drawn, static_seed=True)
+        self._begun = True
         return self._observation(self._env.reset()), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:

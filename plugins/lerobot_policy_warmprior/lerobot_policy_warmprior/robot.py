@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
 from warmprior import Normalizer, WarmPriorActor, keys
 from warmprior.lerobot import LeRobotActor
+from warmprior.lerobot.actor import entry_names
 from warmprior.modules.encoder import ImageEncoder
 
 
@@ -64,10 +65,15 @@ def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
     low, high = (torch.cat(ends) for ends in zip(*bounds, strict=True))
     least, most = _bounds(stats[keys.ACTION])
     actor = policy.acting
+    entries = {feature: name for name, feature in entry_names(config.input_features).items()}
     for part in actor.network.modules():
         if isinstance(part, ImageEncoder):
-            part.cameras = tuple(name.rpartition(".")[2] for name in part.cameras)
+            part.cameras = tuple(entries[name] for name in part.cameras)
     normalizer = Normalizer({state: low, keys.ACTION: least}, {state: high, keys.ACTION: most})
+    for key, (start, end) in {state: (low, high), keys.ACTION: (least, most)}.items():
+        # As LeRobot scales, also where the range is so small that a normaliser only shifts.
+        normalizer.loc(key).copy_((start + end) / 2)
+        normalizer.scale(key).copy_((end - start) / 2)
     return actor.replace(normalizer=normalizer)
 
 
