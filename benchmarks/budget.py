@@ -35,7 +35,7 @@ class BudgetOptions(MeasuredOptions):
 
     def check(self) -> None:
         super().check()
-        check_single(self, "sigma")
+        check_single(self, "sigma", "temperature")
         check_counts(self, "budgets")
         check_given(self, "budgets")
 

@@ -29,7 +29,7 @@ def main(argv: list[str] | None) -> None:
     chunks = {"sources": {"chunk": (1, 2, 4, 8, 16)}}
     presets = {name: with_parts(preset, **chunks) for name, preset in PRESETS.items()}
     options = parse(presets, argv, "chunking", __doc__)
-    check_single(options, "sigma")
+    check_single(options, "sigma", "temperature")
     with started(options, "chunking") as out:
         policies = policies_of(options)
         rows, failures = compare(options, policies)

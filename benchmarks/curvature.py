@@ -13,7 +13,7 @@ import torch
 
 from lab.command_line import parse, script, started
 from lab.comparison import train_all
-from lab.measures import RATIOS, held_out, straightness
+from lab.measures import RATIOS, check_flows, held_out, straightness
 from lab.options import FinishedRun, MeasuredOptions
 from lab.paper import paper_curvature
 from lab.plots import plot_flow_paths
@@ -39,8 +39,7 @@ def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
     presets = {name: study(CurvatureOptions, base, observations=2_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "curvature", __doc__)
-    if not any(method.is_flow for method in options.sources.methods()):
-        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+    check_flows(options.sources.methods())
     with started(options, "curvature") as out:
         run = options.policies
         policies = policies_of(options) if run is None else finished_policies(run, options)

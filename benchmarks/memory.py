@@ -34,7 +34,7 @@ def main(argv: list[str] | None) -> None:
     for run, rows in zip(args.runs, tables, strict=True):
         if "memory_gain" not in rows:
             raise ValueError(f"{run} measured no memory_gain: name a run of robomimic.py or pusht.py")
-    summaries = [summary(rows, top_k=1) for rows in tables]
+    summaries = [summary(rows, top_k=1).assign(iterations=rows["iterations"].max()) for rows in tables]
     gains = pd.concat(summaries)
     gains = gains[gains.memory_gain.notna() & gains.gain.notna()]
     if gains.empty:
@@ -51,7 +51,8 @@ def main(argv: list[str] | None) -> None:
     firsts = dict.fromkeys(rows.method.iloc[0] for rows in summaries)
     save(figure, args.out, f"Gain over {' or '.join(firsts)}", 12)
 
-    text = table(gains, ["setting", "nfe", "temperature", "method"], ["memory_gain", "gain"])
+    apart = [name for name in ("chunk", "iterations") if gains[name].nunique() > 1]
+    text = table(gains, ["setting", *apart, "nfe", "temperature", "method"], ["memory_gain", "gain"])
     print(text, f"\nPicture: {args.out}", sep="")
 
 

@@ -17,7 +17,7 @@ import torch
 
 from lab.command_line import parse, script, started
 from lab.comparison import train_all
-from lab.measures import straightness
+from lab.measures import check_flows, straightness
 from lab.navigation import judge_navigation, play_navigation
 from lab.options import Evaluation, Options, Sources, check_single
 from lab.plots import plot_flow_paths, plot_navigation
@@ -48,6 +48,11 @@ class NavigationOptions(Options):
     def check(self) -> None:
         super().check()
         check_single(self, "chunk")
+        check_flows(self.sources.methods())
+        if self.evaluation.temperature != (1.0,) or self.evaluation.play_on:
+            raise ValueError(
+                "the toy is rolled out to its end with all noise: leave out --temperature, --play-on"
+            )
         if self.data != DataOptions():
             raise ValueError(
                 "the toy has demonstrations of its own: leave out --task, --data and other options of data"

@@ -49,7 +49,7 @@ class DelayOptions(Options):
 
     def check(self) -> None:
         super().check()
-        check_single(self, "chunk")
+        check_single(self, "chunk", "temperature")
         check_given(self, "delay", "guidance")
         check_counts(self, "execute")
         if self.toy != "no" and self.evaluation.play_on:

@@ -17,7 +17,7 @@ import pandas as pd
 
 from lab.command_line import parse, script, started
 from lab.comparison import compare
-from lab.measures import held_out, straightness
+from lab.measures import check_flows, held_out, straightness
 from lab.options import MeasuredOptions, Options, check_single
 from lab.paper import paper_success
 from lab.plots import plot_lines
@@ -40,7 +40,8 @@ def main(argv: list[str] | None) -> None:
     """Train a policy per source and sigma, play it, and measure its flow."""
     presets = {name: preset(base) for name, base in PRESETS.items()}
     options = parse(presets, argv, "sigma", __doc__)
-    check_single(options, "nfe")
+    check_single(options, "nfe", "temperature")
+    check_flows(options.sources.methods())
     with started(options, "sigma") as out:
         policies = policies_of(options)
         # Before the training, so that data that cannot be measured on cost no hours.

@@ -107,6 +107,10 @@ class AgentsOptions(Options):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
         check_given(self, "algorithm", "centre")
+        if self.evaluation.temperature != (1.0,):
+            raise ValueError("agents choose the noise themselves: leave out --temperature")
+        if self.is_toy and (self.horizon is not None or self.evaluation.play_on):
+            raise ValueError("episodes of the toy have one length: leave out --horizon and --play-on")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
         if not self.is_toy and self.policies is None:

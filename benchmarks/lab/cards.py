@@ -25,7 +25,7 @@ def measured(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "training": f"{first['task']}, data {first['data']}: {steps}",
         "demonstrations": code(first.get("demonstrations", "not known")),
     }
-    conditions = [n for n in ("nfe", "delay", "guidance") if n in first]
+    conditions = [n for n in ("nfe", "temperature", "delay", "guidance") if n in first]
     shown = []
     for row in results:
         low, high = success_posterior(row["successes"], row["episodes"]).interval(0.95)

@@ -49,7 +49,10 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "success": (".1%", "success rate: per seed the mean of the best --top-k checkpoints"),
     "seeds": ("d", "training seeds"),
     "checkpoints": ("d", "checkpoints per training"),
-    "low": (".1%", "lower end of the 95% interval of the success rate (last checkpoints, Beta posterior)"),
+    "low": (
+        ".1%",
+        "lower end of the 95% interval of the success rate (the same checkpoints, Beta posterior)",
+    ),
     "high": (".1%", "upper end of the 95% interval of the success rate"),
     "gain": ("+.1%", "success minus the first method's at the same NFE"),
     "one_sigma": ("", "true if the gain exceeds the sum of both deviations over seeds (the paper's rule)"),

@@ -6,7 +6,7 @@ import copy
 import hashlib
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +165,12 @@ def _episodes(data: TensorDictBase) -> list[str]:
     return [hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in parts]
 
 
+def check_flows(methods: Iterable[Method]) -> None:
+    """Raise ValueError if none of the methods has a flow that could be measured."""
+    if not any(method.is_flow for method in methods):
+        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+
+
 def straightness(
     policies: Mapping[Method, Mapping[int, WarmPriorActor]],
     observations: SharedObservations,
@@ -180,9 +186,8 @@ def straightness(
     per policy, training seed and history (`mean`), and one with `seed` None for the average over several
     seeds. Options are those of `curvature`.
     """
+    check_flows(policies)
     policies = {method: actors for method, actors in policies.items() if method.is_flow}
-    if not policies:
-        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     seeds = sorted(next(iter(policies.values())))
     # By method and history, per seed: curvatures, and bounds of the branching cost.
     measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}

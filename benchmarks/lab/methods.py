@@ -211,6 +211,11 @@ class Method:
             if "sigma" in typed_options:
                 raise ValueError(f"--prior {self.text} and --sigma {self.sigma_option:g} both set sigma")
             typed_options["sigma"] = float(self.sigma_option)
+        # 1 and 1.0 are the same policy.
+        typed_options = {
+            k: float(v) if isinstance(defaults.get(k), float) and type(v) is int else v
+            for k, v in typed_options.items()
+        }
         changed = {k: v for k, v in sorted(typed_options.items()) if v is not None and v != defaults.get(k)}
         object.__setattr__(self, "arguments", changed)
         try:
@@ -322,7 +327,12 @@ class Method:
     def temperatures(self, temperatures: Sequence[float]) -> Sequence[float]:
         """Return the temperatures that it is played with; some methods have their own."""
         played = self.parts.played
-        return [played["temperature"]] if "temperature" in played else temperatures
+        return [played["temperature"]] if "temperature" in played else list(dict.fromkeys(temperatures))
+
+    @property
+    def has_two_steps(self) -> bool:
+        """Return True if it is trained at two times, and played in these two steps."""
+        return self.parts.played == TWO_STEPS
 
     def recipe(self, training: TrainingConfig) -> TrainingConfig:
         """Return the recipe with this method's times, and without withholding a history that it ignores."""

@@ -175,6 +175,13 @@ class Options:
         for method in self.sources.methods():
             if self.training.times == "start" and not method.is_regression:
                 raise ValueError(f"--times start trains no flow: leave out {method.name}")
+            if method.has_two_steps and (
+                not self.network.precondition or self.training.weighting == "velocity"
+            ):
+                raise ValueError(
+                    f"{method.name} would weigh its second error a hundredfold: it needs preconditioning and "
+                    "standardised errors"
+                )
             l1, distilled = self.training.objective == "l1", self.training.self_distillation > 0
             if distilled and not method.is_flow:
                 raise ValueError(f"--self-distillation needs a flow: leave out {method.name}")

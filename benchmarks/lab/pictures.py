@@ -66,14 +66,16 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
 
 def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
     """Record the first evaluation episode of a policy as a filmstrip and, with PyAV, as a video."""
-    nfe, task = min(policy.method.nfes(options.evaluation.nfe)), policy.task()
+    nfe, task, actor = min(policy.method.nfes(options.evaluation.nfe)), policy.task(), policy.load()
+    if policy.method.is_flow:
+        actor = actor.replace(temperature=max(options.evaluation.temperature))
     slug = re.sub(r"[^\w.]+", "-", method if "," in method else policy.method.name)
     video = options.run.folder / f"video_{slug}{suffix}.mp4"
     env_options: dict[str, Any] = options.evaluation.environment
     if task.environment is None:
-        env_options = {"env": task.env(policy.load()), "rate": task.video_rate, "success": task.success}
+        env_options = {"env": task.env(actor), "rate": task.video_rate, "success": task.success}
     strip = record_filmstrip(
-        policy.load(),
+        actor,
         seed=EVALUATION_SEED,
         nfe=nfe,
         policy_seed=policy.training.seed,

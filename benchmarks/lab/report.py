@@ -146,9 +146,16 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     return _beside(result, seeds, keys)
 
 
+def _by_temperature(rows: DataFrame) -> bool:
+    """Return True if a method was played at several temperatures."""
+    return "temperature" in rows and rows.groupby("method")["temperature"].nunique().max() > 1
+
+
 def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame:
     """Add to a summary the comparison of each method with the first one in the same setting and NFE."""
     first, place = rows["method"].iloc[0], [name for name in keys if name != "method"]
+    if not _by_temperature(rows) and "temperature" in place:  # a method may have its own
+        place.remove("temperature")
     rows_of_first = rows[rows["method"] == first].set_index(place)
     first_rows = rows_of_first.reindex(pd.MultiIndex.from_frame(rows[place])).set_index(rows.index)
     other = rows["method"] != first
@@ -233,7 +240,7 @@ def _placed(rows: DataFrame) -> DataFrame:
     """Add to a summary the `place` and `column` of its entries in a table, and their `text`."""
     delay = ", delay " + rows["delay"].astype(str) if "delay" in rows else ""
     rows = rows.assign(place=rows["setting"] + delay, column="NFE " + rows["nfe"].astype(str))
-    if "temperature" in rows and rows.groupby("method")["temperature"].nunique().max() > 1:
+    if _by_temperature(rows):
         rows["column"] += ", noise x " + rows["temperature"].map("{:g}".format)
     best = rows.groupby(["place", "column"])["success"].transform("max")
     texts = []

@@ -83,7 +83,7 @@ def branching_cost(
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
-        a_t, velocity = path(a0, rows.target, t)
+        a_t, velocity = path(a0, rows.target, t, generator)
         slices = [slice(i, i + SPLIT) for i in range(0, n * draws, SPLIT)]
         predicted = torch.cat(
             [velocity_field(policy.network, rows.observation[s])(t[s], a_t[s]) for s in slices]

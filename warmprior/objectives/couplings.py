@@ -124,7 +124,7 @@ class ReflowCoupling:
     def __init__(self, teacher: WarmPriorActor, nfe: int = 9) -> None:
         check_whole_numbers(nfe=nfe)
         # Only the teacher's flow, from the source at t = 0.
-        teacher = teacher.replace(start=None, guidance=None)
+        teacher = teacher.replace(start=None, guidance=None, solver="euler", grid="uniform")
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 
     def config(self) -> dict[str, Any]:
