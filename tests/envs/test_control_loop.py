@@ -7,7 +7,10 @@ import pytest
 
 pytest.importorskip("robosuite")
 
+from robosuite.wrappers import Wrapper
+
 from tests.errors import raises
+from warmprior.envs import RobosuiteEnv
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
@@ -117,3 +120,53 @@ def test_refuses_what_it_does_not_implement():
     part["impedance_mode"] = "variable"
     with raises(ValueError, "control_loop='robosuite'"):
         ControlLoop(make_simulator(env_args))
+
+
+def of(robot, gripper=None, **options):
+    env_args = task_env_args("lift")
+    env_args["env_kwargs"] |= {"robots": [robot], **options}
+    if gripper is not None:
+        env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]["gripper"] |= gripper
+    return make_simulator(env_args)
+
+
+class Slow(type(make_simulator(task_env_args("lift")))):
+    def _pre_action(self, action, policy_step=False):
+        super()._pre_action(0.5 * action, policy_step)
+
+
+@pytest.mark.parametrize("change", ["a moving centre", "bare fingers", "a wrapper", "a subclass", "a sensor"])
+def test_what_the_lean_loop_would_bypass_is_stepped_by_robosuite(change):
+    if change == "a moving centre":
+        env = of("IIWA")
+    elif change == "bare fingers":
+        env = of("Panda", {"use_action_scaling": False})
+    else:
+        env = make_simulator(task_env_args("lift"))
+    if change == "a wrapper":
+        env = Wrapper(env)
+    elif change == "a subclass":
+        env.__class__ = Slow
+    elif change == "a sensor":
+        env.modify_observable("cube_pos", "sampling_rate", 2)
+    assert RobosuiteEnv(env=env, horizon=5).control_loop == "robosuite"
+    with raises(ValueError, "control_loop='robosuite'"):
+        ControlLoop(env)
+    assert env.unwrapped.ignore_done if change == "a wrapper" else env.ignore_done
+
+
+@pytest.mark.parametrize("options", [{"gripper_types": None}, {"controller": "JOINT_TORQUE"}])
+def test_robosuites_own_loop_takes_every_arm(options):
+    env_args = task_env_args("lift")
+    if "controller" in options:
+        part = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+        env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"] = {
+            "type": "JOINT_TORQUE",
+            "interpolation": None,
+            "gripper": part["gripper"],
+        }
+    else:
+        env_args["env_kwargs"] |= options
+    keys = ["robot0_eef_pos"]
+    env = RobosuiteEnv(env=make_simulator(env_args), horizon=5, low_dim_keys=keys)
+    assert env.control_loop == "robosuite" and env.rollout(2)["observation"].shape == (2, 3)

@@ -30,7 +30,7 @@ class Arm:
         composite.update_state()  # where the base is, for goals in its frame
         limits = env.sim.model._model.actuator_ctrlrange
         index = robot._ref_actuators_indexes_dict
-        arm, self.fingers = np.array(index["right"]), np.array(index["right_gripper"])
+        arm, self.fingers = np.array(index["right"]), np.array(index["right_gripper"], dtype=int)
         self.constants = (
             np.array(controller.qpos_index),
             np.array(controller.qvel_index),
@@ -85,8 +85,25 @@ class Arm:
         return (controller.ref_pos, controller.ref_ori_mat), (qvel, qpos)
 
 
+def is_plain(env: Any) -> bool:
+    """Return True if :class:`ControlLoop` can step an environment: robosuite's own, with plain arms.
+
+    A wrapper or a subclass that changes a step would be bypassed, and so would sensors with a delay or a rate
+    of their own.
+    """
+    base = require("robosuite.environments.base", "sim").MujocoEnv
+    if not (isinstance(env, base) and all(map(is_plain_arm, env.robots))):
+        return False
+    steps = [getattr(type(env), name).__module__ for name in ("step", "_pre_action", "_post_action")]
+    no_delay = require("robosuite.utils.observables", "sim").NO_DELAY
+    return {name.partition(".")[0] for name in steps} <= {"robosuite", "mimicgen"} and all(
+        sensor._delayer is no_delay and sensor._sampling_timestep <= env.control_timestep + 1e-9
+        for sensor in env._observables.values()
+    )
+
+
 def is_plain_arm(robot: Any) -> bool:
-    """Return True if :class:`ControlLoop` can step a robot: a single OSC_POSE arm with a gripper."""
+    """Return True if a robot is a single OSC_POSE arm on a fixed base, with a gripper."""
     composite = robot.composite_controller
     controller = composite.part_controllers.get("right")
     return bool(
@@ -97,7 +114,16 @@ def is_plain_arm(robot: Any) -> bool:
         and controller.uncoupling
         and controller.interpolator_pos is None
         and controller.interpolator_ori is None
+        and composite.part_controllers["right_gripper"].use_action_scaling
+        and _has_fixed_center(controller)
     )
+
+
+def _has_fixed_center(controller: Any) -> bool:
+    """Return True if the site whose velocity robosuite subtracts cannot move, as that of IIWA does."""
+    model = controller.sim.model
+    site = model.site_name2id(f"{controller.naming_prefix}{controller.part_name}_center")
+    return bool(model._model.body_weldid[model._model.site_bodyid[site]] == 0)
 
 
 @functools.cache
@@ -160,7 +186,7 @@ class StepLoop:
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
         self.env = env
-        env.ignore_done = True
+        getattr(env, "unwrapped", env).ignore_done = True
         self._select(keys)
         self._bind()
 
@@ -186,7 +212,8 @@ class StepLoop:
         sim = self.env.sim
         self._model, self._data = sim.model._model, sim.data._data
         self._bodies: dict[str, int] = {}
-        self._arms = [Arm(self.env, robot) for robot in self.env.robots]
+        arms = [robot.composite_controller.part_controllers["right"] for robot in self.env.robots]
+        self._sites = [sim.model.site_name2id(controller.ref_name) for controller in arms]
 
     def reset(self, seed: int) -> Observations:
         """Start the episode of a seed, without changing the global generators."""
@@ -227,7 +254,7 @@ class StepLoop:
 
     def eef(self, arm: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return the position ``[3]`` (metres) and rotation ``[3, 3]`` of an arm's grip site."""
-        site = self._arms[arm].site
+        site = self._sites[arm]
         return self._data.site_xpos[site].copy(), self._data.site_xmat[site].reshape(3, 3).copy()
 
     def body(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -243,7 +270,7 @@ class ControlLoop(StepLoop):
 
     It supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position and
     orientation and no interpolation, as in robomimic and MimicGen. Raises ValueError for any other robot or
-    controller.
+    controller, and for environments with a step or sensors of their own, see :func:`is_plain`.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -254,6 +281,11 @@ class ControlLoop(StepLoop):
                 raise ValueError(
                     f"the lean loop needs plain OSC_POSE arms: use control_loop='robosuite' for {what}"
                 )
+        if not is_plain(env):
+            raise ValueError(
+                f"the lean loop would bypass a step or sensors that {type(env).__name__} has of its own: use "
+                "control_loop='robosuite'"
+            )
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
         super().__init__(env, keys)
@@ -263,6 +295,7 @@ class ControlLoop(StepLoop):
 
     def _bind(self) -> None:
         super()._bind()
+        self._arms = [Arm(self.env, robot) for robot in self.env.robots]
         nv = self._model.nv
         self._mass, self._jacp, self._jacr = (np.zeros((nv, nv)), np.zeros((3, nv)), np.zeros((3, nv)))
         self._substeps = int(self.env.control_timestep / self.env.model_timestep)

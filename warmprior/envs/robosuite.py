@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.checks import check_choice, check_whole_numbers
-from warmprior.envs.control_loop import ControlLoop, StepLoop, is_plain_arm
+from warmprior.envs.control_loop import ControlLoop, StepLoop, is_plain
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
@@ -63,7 +63,7 @@ class RobosuiteEnv(EnvBase):
             arm's pose and gripper.
         horizon: time limit in control steps; by default the task's, or else the environment's own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`, ``"robosuite"`` for
-            ``env.step``; by default the lean loop if it supports the robots.
+            ``env.step``; by default the lean loop if it supports robots, sensors and ``env.step``.
         from_pixels: True renders ``camera`` at every step. Policies that see images need them only at
             decisions, for which :class:`~warmprior.transforms.CameraImages` renders them.
         camera: name of the rendered camera, or several; ``None`` for the task's first, or ``"agentview"``.
@@ -142,7 +142,7 @@ class RobosuiteEnv(EnvBase):
         self.task = spec
         self._env = env if env_args is None else make_simulator(env_args)
         if control_loop is None:
-            control_loop = "lean" if all(map(is_plain_arm, self._env.robots)) else "robosuite"
+            control_loop = "lean" if is_plain(self._env) else "robosuite"
         if horizon is None:
             # Also if the environment itself has no limit (``ignore_done``): an evaluation would wait for a
             # success that may never come.
