@@ -52,6 +52,12 @@ def test_unknown_environment_uses_what_it_finds(tmp_path):
             read_index(path, observation_keys=nothing)
 
 
+def test_a_file_of_another_simulator_is_read_without_its_environment(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, env_args={"env_name": "Isaac-Lift-v0", "type": 2})
+    assert read_index(path).env_args == {}
+
+
 def test_unknown_environment_keeps_what_is_no_robots(tmp_path):
     """A goal by a name of its own: a policy that is blind to it would learn nothing, without a word."""
     path = tmp_path / "file.hdf5"

@@ -10,7 +10,8 @@ from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import LeRobotDemonstrations
-from warmprior.data.lerobot_index import action_names, state_names
+from warmprior.data.lerobot_index import action_names, read_lerobot_index, state_names
+from warmprior.data.opening import Demonstrations
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3
@@ -90,6 +91,16 @@ def test_images_are_decoded_as_lerobot_does(written):
     assert torch.equal(observation["agentview_image"][15], upright)
     off = observation["robot0_eye_in_hand_image"][15].float() - upright
     assert off.abs().mean() < 8  # a video is lossy
+
+
+def test_cameras_whose_names_end_alike_are_told_apart(tmp_path):
+    images = [("rgb.head", "image"), ("mask.head", "image"), ("wrist", "image")]
+    write_lerobot(tmp_path / "data", (2,), images=images)
+    cameras = [f"observation.images.{name}" for name, _ in images]
+    keys = Demonstrations(f"lerobot:{tmp_path / 'data'}").image_keys(cameras)
+    assert keys == ["rgb.head_image", "mask.head_image", "wrist_image"]
+    index = read_lerobot_index(tmp_path / "data", image_keys=keys)
+    assert list(index.images.values()) == cameras
 
 
 @pytest.mark.parametrize("kind", ["reward", "success"])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise, product
 from pathlib import Path
@@ -215,9 +216,26 @@ def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
     return sorted(set(numbers))
 
 
-def image_key(feature: str) -> str:
-    """Return the name of a camera's images here, such as ``front_image`` for ``observation.images.front``."""
-    return f"{feature.rpartition('.')[2]}_image"
+def short_names(features: Iterable[str]) -> dict[str, str]:
+    """Return a short name of each of LeRobot's features: the last part of its name.
+
+    Where last parts are equal, it is all that is behind ``observation.images.``.
+
+    Examples:
+        >>> from warmprior.data.lerobot_index import short_names
+        >>> list(short_names(["observation.images.left.rgb", "observation.images.right.rgb"]).values())
+        ['left.rgb', 'right.rgb']
+    """
+    features = list(features)
+    last = {name: name.rpartition(".")[2] for name in features}
+    count = Counter(last.values())
+    whole = {name: name.removeprefix("observation.").removeprefix("images.") for name in features}
+    return {name: last[name] if count[last[name]] == 1 else whole[name] for name in features}
+
+
+def camera_images(features: Iterable[str]) -> dict[str, str]:
+    """Return cameras by the names of their images, ``front_image`` for ``observation.images.front``."""
+    return {f"{short}_image": name for name, short in short_names(features).items()}
 
 
 def action_names(arms: int) -> list[str]:
@@ -295,7 +313,7 @@ def read_lerobot_index(
         if key not in columns:
             options = [name for name in columns if name in named or name.startswith("observation")]
             raise unknown(root, "observation", key, options)
-    cameras = {image_key(name): name for name in metadata.camera_keys if name not in metadata.depth_keys}
+    cameras = camera_images(name for name in metadata.camera_keys if name not in metadata.depth_keys)
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     count = len(rows)
     if episodes is not None:

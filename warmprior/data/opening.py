@@ -8,7 +8,7 @@ from typing import Any
 
 from warmprior.data.hdf5 import read_index
 from warmprior.data.lerobot import LeRobotDemonstrations
-from warmprior.data.lerobot_index import image_key, read_lerobot_index
+from warmprior.data.lerobot_index import camera_images, read_lerobot_index
 from warmprior.data.minari import MinariDemonstrations, minari_environment, read_minari_index
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.data.robomimic import RobomimicDemonstrations
@@ -66,7 +66,9 @@ class Demonstrations:
 
     def image_keys(self, names: Sequence[str]) -> list[str]:
         """Return policies' names of images; LeRobot's own, ``observation.images.front``, are converted."""
-        return [image_key(name) if name.startswith("observation.") else name for name in names]
+        images = camera_images(name for name in names if name.startswith("observation."))
+        converted = {name: key for key, name in images.items()}
+        return [converted.get(name, name) for name in names]
 
     def index(self, **options: Any) -> DatasetIndex:
         """Return the index, with options of ``read_index`` (``image_keys``, ``demos`` and so on)."""

@@ -112,7 +112,10 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
     """Raise DatasetError unless there are robomimic's text ``env_name`` and dict ``env_kwargs``."""
     for key, kind in (("env_name", str), ("env_kwargs", dict)):
         if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
-            raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
+            raise DatasetError(
+                f"{what} lacks {key}, or it is not a {kind.__name__}: write it, or remove the description to "
+                "train without an environment"
+            )
     return env_args
 
 

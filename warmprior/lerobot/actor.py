@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from threading import Lock
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.checks import check_shape
+from warmprior.data.lerobot_index import short_names
 from warmprior.history import history_keys
 from warmprior.lerobot.adapter import WarmPriorAdapter
 from warmprior.lerobot.source import ChunkSource
@@ -32,20 +32,17 @@ _TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()
 
 
 def entry_names(features: Iterable[str]) -> dict[str, str]:
-    """Return LeRobot's name of each entry of the observation, by the last part of that name.
+    """Return LeRobot's name of each entry of the observation, by its short name.
 
-    Where last parts are equal, the entry has all that is behind ``observation.images.``. Cameras that do not
-    exist have none.
+    Cameras that do not exist have no entry.
 
     Examples:
         >>> from warmprior.lerobot.actor import entry_names
         >>> entry_names(["observation.state", "observation.images.left.rgb", "observation.images.right.rgb"])
         {'state': 'observation.state', 'left.rgb': 'observation.images.left.rgb', 'right.rgb': ...}
     """
-    named = [name for name in features if not name.startswith(_EMPTY)]
-    last = Counter(name.rpartition(".")[2] for name in named)
-    whole = {name: name.removeprefix("observation.").removeprefix("images.") for name in named}
-    return {short if last[short := name.rpartition(".")[2]] == 1 else whole[name]: name for name in named}
+    named = short_names(name for name in features if not name.startswith(_EMPTY))
+    return {short: name for name, short in named.items()}
 
 
 class LeRobotFlow(TensorDictModuleBase):
