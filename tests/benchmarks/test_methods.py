@@ -18,6 +18,7 @@ def test_methods_are_equal_if_and_only_if_they_do_the_same():
         (("past", H), ("past,correlation=0.0,sigma=0.5", H)),
         (("past,sigma=0.3", H), ("past", H, 0.3)),
         (("gaussian", H), ("gaussian", H, 0.3)),  # --sigma belongs to those that take it
+        (("past,sigma=1", H), ("past", H, 1.0)),
         (("step,stall=1,start_time=0.7", H), ("step,start_time=0.7,stall=1", H)),
     ):
         first, second = Method(*one), Method(*two)
@@ -35,6 +36,10 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     one, same = (Method("edited_prior:Mine", H).config() for _ in range(2))
     file.write_text(code + "    default_sigma = 0.05\n")
     assert one == same != Method("edited_prior:Mine", H).config()
+
+
+def test_a_temperature_that_is_named_twice_is_played_once():
+    assert Method("past", H).temperatures((1.0, 0.5, 1.0)) == [1.0, 0.5]
 
 
 def test_every_method_arrives_in_a_fresh_process():

@@ -72,6 +72,12 @@ def test_methods_and_settings_have_names_that_differ():
     assert list(found["setting"]) == settings
 
 
+def test_a_method_with_its_own_temperature_is_compared_at_the_same_number_of_steps():
+    rows = [row(2, nfe=2), row(7, nfe=2, prior="mip", temperature=0.0)]
+    beside = report.summary(pd.DataFrame(rows), 1).iloc[1]
+    assert (beside["gain"], beside["won"], beside["lost"]) == (pytest.approx(0.5), 5, 0)
+
+
 @pytest.mark.parametrize("top_k", [1, 2, 3])
 def test_a_summary_is_what_scipy_and_counting_say(top_k):
     """All of a row is of the same checkpoints, and their episodes count once each."""
