@@ -19,7 +19,7 @@ from warmprior.deploy import AsyncExecutor
 from warmprior.diagnostics import executed_actions
 from warmprior.history import cold_history, window_history
 from warmprior.lerobot import LeRobotActor
-from warmprior.lerobot.actor import entry_names
+from warmprior.lerobot.names import entry_names
 from warmprior.rl import PriorDecoder
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise, product
@@ -25,6 +24,7 @@ from warmprior.data.replay import (
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
+from warmprior.lerobot.names import short_names
 
 DESCRIPTION = "meta/warmprior.json"
 """The file that :func:`warmprior.data.convert_robomimic` adds to LeRobot's own, and that LeRobot ignores."""
@@ -214,23 +214,6 @@ def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
             f"{root}: {what} must be some of the episodes 0 to {count - 1}, got {list(numbers)}"
         )
     return sorted(set(numbers))
-
-
-def short_names(features: Iterable[str]) -> dict[str, str]:
-    """Return a short name of each of LeRobot's features: the last part of its name.
-
-    Where last parts are equal, it is all that is behind ``observation.images.``.
-
-    Examples:
-        >>> from warmprior.data.lerobot_index import short_names
-        >>> list(short_names(["observation.images.left.rgb", "observation.images.right.rgb"]).values())
-        ['left.rgb', 'right.rgb']
-    """
-    features = list(features)
-    last = {name: name.rpartition(".")[2] for name in features}
-    count = Counter(last.values())
-    whole = {name: name.removeprefix("observation.").removeprefix("images.") for name in features}
-    return {name: last[name] if count[last[name]] == 1 else whole[name] for name in features}
 
 
 def camera_images(features: Iterable[str]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from threading import Lock
 from typing import Any
@@ -15,34 +15,17 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.checks import check_shape
-from warmprior.data.lerobot_index import short_names
 from warmprior.history import history_keys
 from warmprior.lerobot.adapter import WarmPriorAdapter
+from warmprior.lerobot.names import entry_names
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.actor import check_unshared
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior, noise_factor
 
-_EMPTY = "observation.images.empty_camera_"
-"""The beginning of LeRobot's names of cameras that do not exist, whose images it makes itself."""
-
 _TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()
 """A lock per policy: decisions take turns, because each replaces the policy's sampler for its duration."""
-
-
-def entry_names(features: Iterable[str]) -> dict[str, str]:
-    """Return LeRobot's name of each entry of the observation, by its short name.
-
-    Cameras that do not exist have no entry.
-
-    Examples:
-        >>> from warmprior.lerobot.actor import entry_names
-        >>> entry_names(["observation.state", "observation.images.left.rgb", "observation.images.right.rgb"])
-        {'state': 'observation.state', 'left.rgb': 'observation.images.left.rgb', 'right.rgb': ...}
-    """
-    named = short_names(name for name in features if not name.startswith(_EMPTY))
-    return {short: name for name, short in named.items()}
 
 
 class LeRobotFlow(TensorDictModuleBase):

@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
 from warmprior import Normalizer, WarmPriorActor, keys
 from warmprior.lerobot import LeRobotActor
-from warmprior.lerobot.actor import entry_names
+from warmprior.lerobot.names import entry_names
 from warmprior.modules.encoder import ImageEncoder
 
 

@@ -1,0 +1,40 @@
+"""Short names of LeRobot's features."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+_EMPTY = "observation.images.empty_camera_"
+"""The beginning of LeRobot's names of cameras that do not exist, whose images it makes itself."""
+
+
+def short_names(features: Iterable[str]) -> dict[str, str]:
+    """Return a short name of each of LeRobot's features: the last part of its name.
+
+    Where last parts are equal, it is all that is behind ``observation.images.``.
+
+    Examples:
+        >>> from warmprior.lerobot.names import short_names
+        >>> list(short_names(["observation.images.left.rgb", "observation.images.right.rgb"]).values())
+        ['left.rgb', 'right.rgb']
+    """
+    features = list(features)
+    last = {name: name.rpartition(".")[2] for name in features}
+    count = Counter(last.values())
+    whole = {name: name.removeprefix("observation.").removeprefix("images.") for name in features}
+    return {name: last[name] if count[last[name]] == 1 else whole[name] for name in features}
+
+
+def entry_names(features: Iterable[str]) -> dict[str, str]:
+    """Return LeRobot's name of each entry of the observation, by its short name.
+
+    Cameras that do not exist have no entry.
+
+    Examples:
+        >>> from warmprior.lerobot.names import entry_names
+        >>> entry_names(["observation.state", "observation.images.left.rgb", "observation.images.right.rgb"])
+        {'state': 'observation.state', 'left.rgb': 'observation.images.left.rgb', 'right.rgb': ...}
+    """
+    named = short_names(name for name in features if not name.startswith(_EMPTY))
+    return {short: name for name, short in named.items()}
