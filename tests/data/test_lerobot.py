@@ -115,6 +115,17 @@ def test_rewards_are_those_of_the_dataset(tmp_path, kind):
     assert torch.equal(data["next", "terminated"][last], won)
 
 
+def test_recorded_success_and_no_shaped_reward_ends_an_episode(tmp_path):
+    success = {"next.success": {"dtype": "bool", "shape": (1,), "names": None}}
+    features = {name: numbers(w) for name, w in WIDTHS.items()} | {"next.reward": numbers(1)} | success
+    values = write_lerobot(tmp_path / "data", (4, 3, 5, 2), features)
+    last = [3, 6, 11, 13]
+    data = LeRobotDemonstrations(tmp_path / "data").data[last]["next"]
+    assert data["terminated"].flatten().tolist() == values["next.success"][last].flatten().tolist()
+    assert torch.equal(data["truncated"], ~data["terminated"])
+    assert not np.array_equal(values["next.success"][last], values["next.reward"][last] > 0)
+
+
 LAYOUTS = {
     "two": {"observation.environment_state": 10, "observation.state": 9},
     "one": {"observation.state": 19},

@@ -57,8 +57,8 @@ def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, success
             observations=drawn(observation, rng, n + 1),
             actions=drawn(action, rng, n),
             rewards=rng.uniform(size=n).tolist(),
-            terminations=[False] * n,
-            truncations=[False] * (n - 1) + [True],
+            terminations=[False] * (n - 1) + [i == 1],
+            truncations=[False] * (n - 1) + [i != 1],
             infos={"success": np.arange(n) > n - 2} if success else {},
         )
         for i, n in enumerate(LENGTHS)
@@ -76,6 +76,7 @@ def test_steps_are_those_of_minari():
         np.testing.assert_array_equal(mine["observation"], episode.observations[:-1].astype(np.float32))
         np.testing.assert_array_equal(mine["action"], episode.actions)
         np.testing.assert_array_equal(mine["next", "reward"][:, 0], episode.rewards.astype(np.float32))
+        np.testing.assert_array_equal(mine["next", "terminated"][:, 0], episode.terminations)
     assert MinariDemonstrations(name, demos=2).num_episodes == 2
 
 

@@ -54,6 +54,12 @@ class LeRobotReader(DemonstrationReader):
         block = self._rows(self._episodes[demo], feature)[first : first + len(out), part]
         store_finite(block, out, self.name(demo, key), _REBUILD, first)
 
+    def terminated(self, demo: str) -> bool | None:
+        """Do as the base class describes."""
+        if SUCCESS not in self.index.metadata.features:
+            return None
+        return bool(self._rows(self._episodes[demo], SUCCESS)[-1].any())
+
     def _rows(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
         """Return all rows of an episode, ``[rows, width]``."""
         file = episode_file(self.index.metadata, episode)
@@ -138,7 +144,8 @@ class LeRobotDemonstrations(DemonstrationReplay):
     LeRobot repeats the first action, which is part of the target; here the history is masked and zero.
 
     Only the images in ``image_keys`` of the selected episodes are fetched and decoded, once and by LeRobot's
-    own decoder. Without ``next.reward`` the rewards are ``next.success``, or zeros.
+    own decoder. Without ``next.reward`` the rewards are ``next.success``, or zeros. Episodes whose
+    ``next.success`` is True at the end are terminated.
 
     Args:
         place: the dataset's folder, or its repository on the hub (``"user/name"``).

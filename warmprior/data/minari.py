@@ -156,6 +156,10 @@ class MinariReader(DemonstrationReader):
             )
         store_finite(block, out, self.name(demo, key), "Delete the episode, or download it again.", first)
 
+    def terminated(self, demo: str) -> bool | None:
+        """Do as the base class describes."""
+        return bool(self._values(demo, "terminations")[-1])
+
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Do as the base class describes."""
         frames = torch.from_numpy(self._values(demo, f"obs/{key}")[: len(out)])

@@ -99,6 +99,10 @@ class DemonstrationReader(ABC):
         Rewards that are not recorded are zeros.
         """
 
+    def terminated(self, demo: str) -> bool | None:
+        """Return whether a demo ended by itself, as recorded; None if only its rewards tell."""
+        return None
+
     @abstractmethod
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
@@ -381,8 +385,11 @@ def _fill(
         data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)
-    success = solved(data["next", "reward"][last], index.env_args)
-    for key, value in (("done", True), ("terminated", success), ("truncated", ~success)):
+    ended = solved(data["next", "reward"][last], index.env_args)
+    for i, demo in enumerate(index.demos):
+        if (recorded := reader.terminated(demo)) is not None:
+            ended[i] = recorded
+    for key, value in (("done", True), ("terminated", ended), ("truncated", ~ended)):
         flag = data["next", key]
         flag.zero_()
         flag[last] = value
