@@ -16,7 +16,6 @@ QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several routes)?", "PastPrior(8), nfe=3", BLUE),
     ("Are actions absolute joint targets,\nor absolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
     ("At most 25 scripted demos, and time\nfor only one evaluation per chunk?", "PastPrior(8), nfe=1", BLUE),
-    ("More than 100 human demos, and time\nfor nine evaluations per chunk?", "GaussianPrior(8), nfe=9", GREY),
 )
 
 
@@ -40,8 +39,8 @@ def box(
 
 def flowchart() -> None:
     """Draw chart H: the choice of a source."""
-    picture, axis = canvas(6.4, 4.6)
-    left, right, step, top = 17.0, 51.0, 9.2, 41.4
+    picture, axis = canvas(6.4, 3.7)
+    left, right, step, top = 17.0, 51.0, 9.2, 32.4
     for k, (question, answer, color) in enumerate(QUESTIONS):
         y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)

@@ -92,8 +92,8 @@ def sentences() -> dict[str, list[str]]:
     }
     loss = [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in (GAUSSIAN, *WARM)]
     pusht = {
-        count: {s: recorded("pusht", s, 9, demonstrations=count) for s in (GAUSSIAN, *WARM)}
-        for count in (50, 206)
+        count: {s: solved(run, s, 9) for s in (GAUSSIAN, *WARM)}
+        for count, run in ((50, "pusht_50"), (206, "pusht_206_45000"))
     }
     fifty = [whole(pusht[50][s]) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
