@@ -90,6 +90,9 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
     assert SerialEnv(2, lambda: env).rollout(2)["observation"][1, 1].tolist() == [200.0, 1.0, 0.0]
     with raises(ValueError, "'choice'", "FlattenObservation"):
         gym_env(Signs())
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    both = gymnasium.vector.SyncVectorEnv([lambda: Dial(nested=True)] * 2, autoreset_mode=mode)
+    assert gym_env(both, observation_keys=["dial", "turns"]).reset()["observation"].shape == (2, 3)
 
 
 def test_every_seed_is_one_reset_and_later_episodes_are_others():

@@ -114,7 +114,7 @@ def is_plain_arm(robot: Any) -> bool:
         and controller.uncoupling
         and controller.interpolator_pos is None
         and controller.interpolator_ori is None
-        and composite.part_controllers["right_gripper"].use_action_scaling
+        and getattr(composite.part_controllers["right_gripper"], "use_action_scaling", False)
         and _has_fixed_center(controller)
     )
 

@@ -107,12 +107,13 @@ def gym_env(
         base.set_info_dict_reader(_Infos(dtypes))
     base.ends_at = success if terminate_on_success else None
     specs = {key: base.observation_spec[present[key]] for key in chosen}
-    if others := [k for k, spec in specs.items() if spec.ndim != 1 and (spec.ndim == 0 or len(specs) > 1)]:
+    ndims = {key: spec.ndim - len(base.batch_size) for key, spec in specs.items()}
+    if others := [key for key, ndim in ndims.items() if ndim < 1 or (ndim > 1 and len(specs) > 1)]:
         raise ValueError(
             f"the observations {others} are no vectors: leave them out of observation_keys, or wrap the "
             "environment in gymnasium.wrappers.FlattenObservation"
         )
-    integers = {k: spec for k, spec in specs.items() if spec.ndim == 1 and not spec.dtype.is_floating_point}
+    integers = {k: spec for k, spec in specs.items() if ndims[k] == 1 and not spec.dtype.is_floating_point}
     transforms = [DoubleToFloat()]
     for dtype in {spec.dtype for spec in integers.values()}:
         names = [present[key] for key, spec in integers.items() if spec.dtype == dtype]
