@@ -332,12 +332,9 @@ def read_index(
             )
         # A file without a description comes from a robot, or from another simulator than robosuite, whose
         # type is 1 in robomimic.
-        foreign = isinstance(described, dict) and described.get("type", 1) != 1
-        env_args = (
-            {}
-            if described is None or foreign
-            else check_env_args(f"{path}: data.attrs['env_args']", described)
-        )
+        if isinstance(described, dict) and described.get("type", 1) != 1:
+            described = None
+        env_args = {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
         task = task_of_env(env_args) if env_args else None
         if observation_keys is not None:
             keys = tuple(observation_keys)
