@@ -138,21 +138,23 @@ def submit(
     """Submit the jobs that train, measure and play a policy; `add` gets the row of each complete cell."""
     last, was_trained = policy.training.iterations, policy.is_trained
     episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
-    measures: dict[int, dict[str, Any]] = {}  # of the last checkpoint, by NFE; earlier ones are only played
+    # Of the last checkpoint, by temperature and NFE; earlier ones are only played.
+    measures: dict[float, dict[int, dict[str, Any]]] = {}
 
     def trained(result: None) -> None:
         jobs.say(f"{'found' if was_trained else 'trained'} {policy}, {last} iterations")
 
-    def measured(measures_by_nfe: dict[int, dict[str, Any]]) -> None:
-        measures.update(measures_by_nfe)
-        for cell in [cell for cell in cells if cell.checkpoint == last]:
+    def measured(temperature: float, by_nfe: dict[int, dict[str, Any]]) -> None:
+        measures[temperature] = by_nfe
+        for cell in [c for c in cells if c.checkpoint == last and c.temperature == temperature]:
             played(cell, [])
 
     def played(cell: Cell, new_episodes: list[Episode]) -> None:
         episodes[cell] += new_episodes
         count, at_end = len(episodes[cell]), cell.checkpoint == last
-        if count == evaluation.episodes and (measures or not at_end):
-            complete = row(policy, cell, episodes[cell], measures.get(cell.nfe, {}) if at_end else {})
+        if count == evaluation.episodes and (cell.temperature in measures or not at_end):
+            measured_at_end = measures[cell.temperature].get(cell.nfe, {}) if at_end else {}
+            complete = row(policy, cell, episodes[cell], measured_at_end)
             add(complete)
             jobs.say(f"played {policy}, {cell}: {complete['successes']} of {count} episodes solved")
 
@@ -160,8 +162,9 @@ def submit(
     training: dict[str, Any] = {"training": True, "status": policy.status, "then": trained, "group": group}
     first = jobs.submit(f"train {policy}", train, policy, **training)
     after: dict[str, Any] = {"after": first, "group": group}
-    if any(cell.checkpoint == last for cell in cells):
-        jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
+    for temperature in dict.fromkeys(cell.temperature for cell in cells if cell.checkpoint == last):
+        job_name, then = f"measure {policy}, temperature {temperature}", partial(measured, temperature)
+        jobs.submit(job_name, measure, policy, evaluation.nfe, temperature, then=then, **after)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
     for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
         job_options, job_seeds = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]

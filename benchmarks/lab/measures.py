@@ -49,9 +49,12 @@ RATIOS = {
 }
 
 
-def measure(trained: Policy, nfe: Sequence[int]) -> dict[int, dict[str, float | None]]:
+def measure(
+    trained: Policy, nfe: Sequence[int], temperature: float = 1.0
+) -> dict[int, dict[str, float | None]]:
     """Return the measures of a policy on its training data, by NFE; all policies get the same draws."""
     policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
+    policy = policy.replace(temperature=temperature)
     nfes, observation_steps = method.nfes(nfe), trained.network.observation_steps
     shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))

@@ -122,3 +122,12 @@ def test_the_memory_gain_of_a_network_that_sees_the_history_is_that_of_what_it_s
     trained = SimpleNamespace(load=lambda: actor, task=task, method=method, network=network)
     found = measure(trained, (1,))
     assert found[1]["memory_gain"] == pytest.approx(0.4, rel=1e-4)
+
+
+def test_measures_are_those_at_the_temperature_of_the_row():
+    stays = WarmPriorActor(Field(lambda t, a, o: torch.zeros_like(a)), GaussianPrior(H))  # actions are noise
+    method, network = Method("gaussian", H), NetworkOptions()
+    trained = SimpleNamespace(load=lambda: stays, task=task, method=method, network=network)
+    leak = {t: measure(trained, (1,), t)[1]["source_leak"] for t in (1.0, 0.5, 0.0)}
+    assert leak[1.0] > 0
+    assert leak == pytest.approx({t: t * leak[1.0] for t in leak}, rel=1e-4)
