@@ -93,6 +93,32 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
     mode = gymnasium.vector.AutoresetMode.SAME_STEP
     both = gymnasium.vector.SyncVectorEnv([lambda: Dial(nested=True)] * 2, autoreset_mode=mode)
     assert gym_env(both, observation_keys=["dial", "turns"]).reset()["observation"].shape == (2, 3)
+    with raises(ValueError, "solved", "ParallelEnv"):
+        gym_env(both, success="solved")
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_observations_are_float32_and_stay_as_they_were_seen(dtype):
+    class OneBuffer(Dial):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gymnasium.spaces.Box(-9.0, 9.0, (2,), dtype)
+            self.buffer = np.zeros(2, dtype)
+
+        def _seen(self):
+            self.buffer[:] = self.at, -self.at
+            return self.buffer
+
+    bare, env = Dial(), gym_env(OneBuffer())
+    expected = [bare.reset(seed=3)[0], *(bare.step(action.numpy())[0] for action in actions())]
+    env.set_seed(3)
+    data = env.reset()
+    kept = [data["observation"]]
+    for action in actions():
+        data = env.step(data.set("action", action))["next"]
+        kept.append(data["observation"])
+    assert {seen.dtype for seen in kept} == {torch.float32}
+    np.testing.assert_allclose(torch.stack(kept), np.stack(expected), atol=0.01)
 
 
 def test_every_seed_is_one_reset_and_later_episodes_are_others():

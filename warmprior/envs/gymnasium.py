@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import os
 from collections.abc import Mapping, Sequence
@@ -57,6 +58,10 @@ class _Gym(GymWrapper):
                 result.set(flag, torch.ones_like(result[flag]))
         return result
 
+    def read_obs(self, observations: Any) -> dict[str, Any]:
+        # An environment may write all its observations into one buffer.
+        return super().read_obs(copy.deepcopy(observations))
+
     def _set_seed(self, seed: int | None) -> None:
         self._next = seed
 
@@ -86,7 +91,8 @@ def gym_env(
 
     Raises:
         KeyError: if an entry does not exist.
-        ValueError: if an observation is not a vector, such as a discrete one.
+        ValueError: if an observation is not a vector, such as a discrete one, or entries of ``info`` are
+            asked of a vector environment.
 
     Examples:
         >>> import gymnasium
@@ -103,6 +109,11 @@ def gym_env(
         raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
     dtypes = {success: torch.bool} if success is not None else {}
     dtypes |= dict.fromkeys(measures, torch.float32)
+    if dtypes and base.batch_size:
+        raise ValueError(
+            f"entries of info ({', '.join(dtypes)}) are read from single environments: give torchrl's "
+            "ParallelEnv one per worker, in place of a vector environment"
+        )
     if dtypes:
         base.set_info_dict_reader(_Infos(dtypes))
     base.ends_at = success if terminate_on_success else None
@@ -113,10 +124,11 @@ def gym_env(
             f"the observations {others} are no vectors: leave them out of observation_keys, or wrap the "
             "environment in gymnasium.wrappers.FlattenObservation"
         )
-    integers = {k: spec for k, spec in specs.items() if ndims[k] == 1 and not spec.dtype.is_floating_point}
+    floats = torch.float32, torch.float64
+    cast = {key: spec.dtype for key, spec in specs.items() if ndims[key] == 1 and spec.dtype not in floats}
     transforms = [DoubleToFloat()]
-    for dtype in {spec.dtype for spec in integers.values()}:
-        names = [present[key] for key, spec in integers.items() if spec.dtype == dtype]
+    for dtype in set(cast.values()):
+        names = [present[key] for key, found in cast.items() if found == dtype]
         transforms.append(DTypeCastTransform(dtype, torch.float32, in_keys=names))
     if chosen != [OBSERVATION]:
         transforms.append(CatTensors([present[key] for key in chosen], OBSERVATION, sort=False))
