@@ -105,6 +105,12 @@ def test_actions_that_are_no_vector_are_refused(action, fact):
         MinariDemonstrations(written(action=action))
 
 
+@pytest.mark.parametrize("observation", [Discrete(4), Box(-1, 1, (2, 2), np.float32)])
+def test_observations_without_a_vector_are_refused(observation):
+    with raises(DatasetError, str(observation), "FlattenObservation"):
+        MinariDemonstrations(written(observation=observation))
+
+
 def test_what_there_is_not(root):
     with raises(FileNotFoundError, "toy/none/human-v0", "MINARI_DATASETS_PATH"):
         MinariDemonstrations("toy/none/human-v0")

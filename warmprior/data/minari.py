@@ -77,6 +77,11 @@ def read_minari_index(
         raise DatasetError(f"{where}: actions are {action}, but a flow needs one vector of real numbers")
     spaces = dict(_spaces(dataset.observation_space))
     vectors = {key: math.prod(space.shape) for key, space in spaces.items() if _is_vector(space)}
+    if not vectors:
+        raise DatasetError(
+            f"{where}: observations are {dataset.observation_space}, but a policy needs a vector, or a "
+            "dictionary with one: record them with gymnasium.wrappers.FlattenObservation"
+        )
     pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
     chosen = tuple(vectors if observation_keys is None else observation_keys)
     for key in chosen:
