@@ -141,15 +141,12 @@ def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
         assert pages.with_tables(texts[page], table) == texts[page]
     text = "".join(texts.values())
     played = {name for _, name, _ in pages.PLAYED.findall(text)}
-    assert played == {path.stem for path in shared.DATA.glob("*.jsonl")}
+    assert played == {path.stem for path in shared.DATA.iterdir()}
     shown = set(re.findall(r"_static/results/(\w+)\.svg\)", text))
     assert shown == {path.stem for path in shared.OUT.iterdir()}
     for page, sentences in importlib.import_module("sentences").sentences().items():
         words = " ".join(re.sub(r"\]\(.*?\)", "", (DOCS / page).read_text().replace("[", "")).split())
         assert [sentence for sentence in sentences if sentence not in words] == [], page
-    for file in shared.DATA.glob("*.csv"):
-        rows = shared.read(file.stem)
-        assert rows["success"].between(0, 100).all() and rows["command"].notna().all()
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,9 @@
-"""Tables in pages: the marked one of a page, and one per run whose rows it names."""
+"""Tables in pages: the marked ones of a page, and one per run whose rows it names."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from shared import GAUSSIAN, SOURCES, read_played, shown_sources
 from lab.statistics import chosen_elsewhere
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the marked table of a page."""
+"""This matches a marked table of a page."""
 
 PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
 """This matches the table of a run's rows in a page: by NFE and noise, by sigma, or by chunk length."""
@@ -23,8 +23,8 @@ def played_table(name: str) -> str:
     """Return success of a run in Markdown: percent, and episodes won and lost against the Gaussian source.
 
     There is a line per NFE and factor of the source's noise, and per NFE a line in which every source has its
-    own best factor, chosen on other episodes, if the same episodes were played with every factor. Seeds are
-    pooled.
+    own best factor, chosen on other episodes, if the same episodes were played with every factor. Tasks and
+    seeds are pooled.
     """
     rows = read_played(name)
     names = shown_sources(rows)
@@ -39,10 +39,10 @@ def played_table(name: str) -> str:
 
 
 def _solved(rows: DataFrame) -> dict[float, dict[str, np.ndarray]]:
-    """Return the outcomes of the episodes of all seeds, by factor of the noise and source."""
+    """Return the outcomes of the episodes of all tasks and seeds, by factor of the noise and source."""
     solved: dict[float, dict[str, np.ndarray]] = {}
     for (noise, source), group in rows.groupby(["noise", "source"], sort=False):
-        outcomes = np.concatenate(list(group.sort_values("seed")["solved"]))
+        outcomes = np.concatenate(list(group.sort_values(["task", "seed"])["solved"]))
         solved.setdefault(noise, {})[source] = outcomes
     return solved
 
@@ -95,18 +95,19 @@ def study_table(column: str, name: str) -> str:
     return "\n".join(text) + "\n"
 
 
-def with_tables(page: str, text: str) -> str:
-    """Return a page with its table, and the tables of the runs whose rows it names."""
+def with_tables(page: str, tables: Iterable[str]) -> str:
+    """Return a page with its tables, in their order, and those of the runs whose rows it names."""
+    texts = iter(tables)
 
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
         return f"{kind} {name}{end}{played_table(name) if kind == 'rows' else study_table(kind, name)}"
 
-    page = TABLE.sub(lambda _: text, page)
+    page = TABLE.sub(lambda _: next(texts), page)
     return PLAYED.sub(table_of, page)
 
 
-def write(pages: Mapping[Path, str]) -> None:
+def write(pages: Mapping[Path, Iterable[str]]) -> None:
     """Write the tables into their pages."""
-    for page, text in pages.items():
-        page.write_text(with_tables(page.read_text(), text))
+    for page, tables in pages.items():
+        page.write_text(with_tables(page.read_text(), tables))

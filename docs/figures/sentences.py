@@ -5,15 +5,16 @@ The tests look for each in its page. A sentence that is not there has older numb
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
-from leaderboard import DOOR, standings
+from leaderboard import DOOR, pairs, standings, trials
 from pages import own_best
 from pandas import DataFrame
-from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read, read_played
+from results import GROUPS, LENGTHS, TEN, TWENTY_FIVE, WARM
+from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
 
-WARM = (PAST, PREVIEW, CORRELATED)
-TEN, TWENTY_FIVE = "10: square, can and stack", "25: square, can and stack"
-ONE_ARM, EIGHT = "150 or 300: six settings of one arm", "150 or 300: all eight settings"
+SHORT, LONG = zip(*(runs for name, runs in LENGTHS.items() if "operators" in name), strict=True)
 
 
 def whole(number: float) -> int:
@@ -50,40 +51,37 @@ def two_seeds_of(run: str, source: str) -> float:
     return 100 * rows[rows["seed"] < 2]["success_rate"].mean()
 
 
-def pair(run: str, source: str) -> str:
-    """Return the episodes won and lost against the Gaussian source, over all NFE."""
+def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
+    """Return the episodes won and lost against the Gaussian source, over runs and NFE (9, 3 and 1)."""
     won = lost = 0
-    for nfe in 9, 3, 1:
-        both = [
-            played(run, name, nfe).set_index("seed")["solved"].sort_index() for name in (source, GAUSSIAN)
-        ]
-        for outcomes, base in zip(*both, strict=True):
-            won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
+    for run in runs:
+        for nfe in nfes or (9, 3, 1):
+            both = [
+                played(run, name, nfe).set_index("seed")["solved"].sort_index() for name in (source, GAUSSIAN)
+            ]
+            for outcomes, base in zip(*both, strict=True):
+                won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
     return f"{won} : {lost}"
 
 
-def recorded(file: str, source: str, nfe: int, **chosen: object) -> float:
-    """Return the mean success of a source over those rows of a CSV file that have the chosen values."""
-    rows = read(file)
-    for column, value in {"source": source, "nfe": nfe, **chosen}.items():
-        rows = rows[rows[column] == value]
-    return rows["success"].mean()
+def mean(runs: Iterable[str], source: str, nfe: int) -> float:
+    """Return the mean success of a source over the tasks of some runs, in percent."""
+    rows = read_cells(runs)
+    return rows[(rows["source"] == source) & (rows["nfe"] == nfe)]["success"].mean()
 
 
-def gain(file: str, source: str, nfe: int, **chosen: object) -> float:
-    """Return how many points a source is ahead of the Gaussian source in these rows."""
-    return recorded(file, source, nfe, **chosen) - recorded(file, GAUSSIAN, nfe, **chosen)
+def gain(runs: Iterable[str], source: str, nfe: int) -> float:
+    """Return how many points a source is ahead of the Gaussian source, on the mean of some runs' tasks."""
+    return mean(runs, source, nfe) - mean(runs, GAUSSIAN, nfe)
 
 
 def sentences() -> dict[str, list[str]]:
     """Return the sentences of each page."""
     board = standings().set_index(["source", "nfe"])
-    few = [gain("means", s, 1, setting=name) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
-    longer = {
-        nfe: [solved("square_mh_80000", s, nfe) - solved("square_mh_80000", GAUSSIAN, nfe) for s in WARM]
-        for nfe in (9, 1)
-    }
-    nine, one = ({s: whole(solved("square_mh_80000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 1))
+    few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
+    short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
+    correlated = {nfe: whole(gain(LONG, CORRELATED, nfe)) for nfe in (9, 3, 1)}
+    transport = [whole(mean([runs[-1]], s, 1)) for runs in (SHORT, LONG) for s in (GAUSSIAN, PAST)]
     door = {nfe: {s: whole(solved("door_20000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 3, 1)}
     rows = read_played("door_20000")
     best = {
@@ -100,36 +98,31 @@ def sentences() -> dict[str, list[str]]:
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     mip = board.loc["mip", 2]
     joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
-    six = [-gain("one_step", s, 1, style="mh") for s in (PAST, PREVIEW)]
-    ten = {
-        nfe: [recorded("steps", s, nfe, demonstrations=10) for s in (GAUSSIAN, PAST, PREVIEW)]
-        for nfe in (9, 1)
-    }
     fall = {
         s: f"{whole(two_seeds_of('door_20000', s))} to {whole(two_seeds_of('door_80000', s))}"
         for s in (GAUSSIAN, PAST)
     }
-    three, single = (recorded("steps", GAUSSIAN, nfe, demonstrations=25) for nfe in (3, 1))
-    correlated = [gain("means", CORRELATED, 1, setting=name) for name in (ONE_ARM, EIGHT)]
-    behind = [
-        whole(-gain("steps", PREVIEW, 9, task="square", style=style, demonstrations=count))
-        for style, count in (("ph", 150), ("mh", 300))
-    ]
+    best_mean = {s: whole(board.loc[s, 9]["best noise"]) for s in (GAUSSIAN, PAST)}
+    won, lost = pairs().loc[PAST, 9]
+    at_best = [own_best(part) for _, part in trials(own_noise=False).query("nfe == 9").groupby("family")]
+    won_at_best, lost_at_best = (
+        sum((of[a] > of[b]).sum() for of in at_best) for a, b in ((PAST, GAUSSIAN), (GAUSSIAN, PAST))
+    )
     return {
         "../README.md": [
             f"({whole(mip['mean'])}% on average)",
-            f"WP-Past and WP-Preview succeed {span(few)} points more often",
-            f"succeeds {whole(correlated[1])} points more often",
-            f"succeed {span(longer[9])} points more often at nine steps and "
-            f"{span([-n for n in longer[1]])} less often at one",
+            f"solves {whole(board.loc[PAST, 9]['mean'])}% of the episodes and the Gaussian source "
+            f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
+            f"({best_mean[PAST]} and {best_mean[GAUSSIAN]}%)",
+            f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
+            f"{span(short)} points less often at one step after 10,000 iterations",
+            f"succeeds {correlated[9]} points more often at nine steps ({pair(LONG, CORRELATED, 9)}) "
+            f"and {correlated[3]} at three, {-correlated[1]} less often at one",
         ],
         "which_source.md": [
             f"{span(joints)}% at three steps",
-            f"WP-Past and WP-Preview succeed {span(six)} points less often",
-            f"{whole(three - single)} points more often at three",
+            f"WP-Past and WP-Preview succeed {span(short)} points less often",
             f"the Gaussian source falls from {fall[GAUSSIAN]}% at three steps, WP-Past from {fall[PAST]}",
-            f"solve {span(ten[9])}% at nine steps, and {span(ten[1])}% at one",
-            f"{span([-n for n in longer[1]])} less often at one",
             "at three steps "
             f"the Gaussian source succeeds in {door[3][GAUSSIAN]}% of the episodes "
             f"and correlated noise in {door[3][CORRELATED]}%",
@@ -139,23 +132,27 @@ def sentences() -> dict[str, list[str]]:
             f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (one seed)",
             f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
             f"solves {whole(mip['Push-T, 206'])}% with 206",
-            f"all warm sources succeed {span(longer[9])} points more",
+            f"the Gaussian source then solves {transport[2]}% at one step in place of {transport[0]}, "
+            f"and WP-Past {transport[3]} in place of {transport[1]}",
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
         ],
         "leaderboard.md": [
+            f"WP-Past solves {best_mean[PAST]}% and the Gaussian source {best_mean[GAUSSIAN]} "
+            f"({won_at_best} : {lost_at_best})",
+            f"with 25 demonstrations WP-Past at nine steps ({pair(['pusht_25'], PAST, 9)}), "
+            f"with 50 too ({pair(['pusht_50'], PAST, 9)})",
             f"({best[9][GAUSSIAN]}%; WP-Past and WP-Preview {common([best[9][PAST], best[9][PREVIEW]])})",
             f"correlated noise solves {best[1][CORRELATED]}% and the Gaussian source {best[1][GAUSSIAN]}",
             f"({whole(mip[DOOR])} against {max(n for at in door.values() for n in at.values())}%)",
             f"it solves {whole(solved('pusht_50', 'mip-past', 2, 0))}%, and MIP {whole(mip['Push-T, 50'])}",
-            f"over all steps WP-Past {pair('door_80000', PAST)})",
-            f"with 206 ({pair('pusht_206_80000', PAST)}, one seed)",
+            f"over all steps WP-Past {pair(['door_80000'], PAST)})",
+            f"with 206 ({pair(['pusht_206_80000'], PAST)}, one seed)",
         ],
         "results.md": [
-            f"on average succeeds {span(correlated)} points more often",
-            f"by {behind[0]} points with one operator, by {behind[1]} with six",
-            f"at nine the Gaussian source solves {nine[GAUSSIAN]}%, WP-Past {nine[PAST]}, "
-            f"WP-Preview and correlated noise {common([nine[PREVIEW], nine[CORRELATED]])}; at one step "
-            f"they solve {one[GAUSSIAN]}, {one[PAST]}, {one[PREVIEW]} and {one[CORRELATED]}",
+            f"At one step WP-Past solves {transport[3]}% on transport and the Gaussian source "
+            f"{transport[2]}, where they solve {transport[1]} and {transport[0]} after 10,000",
+            f"({pair(LONG, CORRELATED, 9)} at nine, {pair(LONG, CORRELATED, 3)} at three, "
+            f"{pair(LONG, CORRELATED, 1)} at one)",
         ],
         "faq.md": [f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0)"],
     }

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pandas import DataFrame, Series, read_csv, read_json
+from pandas import DataFrame, Series, concat, read_json
 
 INK = "#767676"  # text and lines, which a white and a black page show equally well
 matplotlib.rcParams |= {"savefig.transparent": True, "grid.color": INK, "grid.alpha": 0.3}
@@ -21,35 +22,17 @@ SVG = {"metadata": {"Date": None}}
 DOCS = Path(__file__).parents[1]
 DATA, OUT = DOCS / "results", DOCS / "_static" / "results"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
-CORRELATED, WIDE = "past,correlation=0.5", "past,sigma=1"
-SOURCES = {  # label, colour and marker in charts, where markers of INK are hollow
+CORRELATED = "past,correlation=0.5"
+SOURCES = {  # label, colour and marker in charts
     GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
     PAST: ("WP-Past", "#1f77b4", "o"),
     PREVIEW: ("WP-Preview", "#d95f02", "o"),
     CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
-    WIDE: ("WP-Past, sigma = 1", "#984ea3", "o"),
-    "preview,correlation=0.5": ("WP-Preview, correlated noise", "#e6ab02", "o"),
-    "ot": ("OT-CFM", INK, "s"),
-    "cvae": ("learned, autoencoder", INK, "^"),
-    "leap": ("learned, from the observation", INK, "v"),
-    "step,start_time=0.5": ("STEP", INK, "D"),
-    "history": ("history conditioning", INK, "P"),
-    "a2a": ("learned, from the last actions", INK, "X"),
-    "forecast": ("learned, from both", INK, "*"),
-    "regression": ("regression", INK, "p"),
     "mip": ("MIP", "#a6761d", "s"),
     "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
     "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
 }
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
-OPERATORS = {"ph": "one operator", "mh": "six operators"}
-
-
-def read(name: str) -> DataFrame:
-    """Return the rows of a file, with the number of episodes of each."""
-    rows = read_csv(DATA / f"{name}.csv", comment="#")
-    tasks = rows["settings"] if "settings" in rows else rows["task"].str.split().str.len()
-    return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
 
 
 def read_played(name: str) -> DataFrame:
@@ -59,6 +42,31 @@ def read_played(name: str) -> DataFrame:
     noise = rows.get("temperature", Series(1.0, rows.index)).fillna(1.0)  # 1 if unnamed
     rows = rows.assign(source=rows["prior"] + options, noise=noise)
     return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
+
+
+def with_own_noise(rows: DataFrame) -> DataFrame:
+    """Return the rows that were played with the noise of each source's training (MIP's is 0)."""
+    return rows[rows["noise"] == rows.groupby("source")["noise"].transform("max")]
+
+
+def read_cells(names: Iterable[str]) -> DataFrame:
+    """Return success at the own noise of each source, a row per task, demonstrations, source and NFE.
+
+    Its columns ``success`` (percent) and ``total`` are over all seeds, whose number is in ``seeds``.
+    """
+    rows = concat([with_own_noise(read_played(name)).assign(run=name) for name in names])
+    keys = ["run", "task", "data", "iterations", "source", "nfe"]
+    cells = rows.groupby(keys, as_index=False, sort=False).agg(
+        successes=("successes", "sum"), total=("episodes", "sum"), seeds=("seed", "nunique")
+    )
+    return cells.assign(success=100 * cells["successes"] / cells["total"])
+
+
+def at_nine_three_one(rows: DataFrame, source: str) -> str:
+    """Return the mean success of a source over cells at NFE 9, 3 and 1, or at the only NFE that it has."""
+    rates = rows[rows["source"] == source].groupby("nfe")["success"].mean()
+    places = (9, 3, 1) if 1 in rates.index else rates.index
+    return "/".join(f"{rates[nfe] + 1e-6:.0f}" for nfe in places)
 
 
 def wilson(success: float, total: float) -> np.ndarray:
@@ -103,13 +111,13 @@ def beside(k: int, count: int) -> float:
     return 1 + 0.03 * (k - (count - 1) / 2)
 
 
-def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool = True) -> None:
-    """Draw success against a column, a line per source."""
+def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int]) -> None:
+    """Draw the mean success over cells against a column, a line per source."""
     for k, source in enumerate(shown := shown_sources(rows)):
         label, color, mark = SOURCES[source]
         part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
         ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
-        bars = np.abs(ends - part["success"].to_numpy()) if interval else None
+        bars = np.abs(ends - part["success"].to_numpy())
         places = part.index.to_numpy(dtype=float) * beside(k, len(shown))
         axis.errorbar(
             places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
