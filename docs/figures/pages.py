@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -95,8 +95,10 @@ def study_table(column: str, name: str) -> str:
     return "\n".join(text) + "\n"
 
 
-def with_tables(page: str, tables: Iterable[str]) -> str:
+def with_tables(page: str, tables: Sequence[str]) -> str:
     """Return a page with its tables, in their order, and those of the runs whose rows it names."""
+    if len(places := TABLE.findall(page)) != len(tables):
+        raise ValueError(f"{len(tables)} tables for {len(places)} places in the page")
     texts = iter(tables)
 
     def table_of(match: re.Match[str]) -> str:
@@ -107,7 +109,7 @@ def with_tables(page: str, tables: Iterable[str]) -> str:
     return PLAYED.sub(table_of, page)
 
 
-def write(pages: Mapping[Path, Iterable[str]]) -> None:
+def write(pages: Mapping[Path, Sequence[str]]) -> None:
     """Write the tables into their pages."""
     for page, tables in pages.items():
         page.write_text(with_tables(page.read_text(), tables))

@@ -80,7 +80,7 @@ def sentences() -> dict[str, list[str]]:
     board = standings().set_index(["source", "nfe"])
     few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
-    correlated = {nfe: whole(gain(LONG, CORRELATED, nfe)) for nfe in (9, 3, 1)}
+    correlated = {nfe: whole(abs(gain(LONG, CORRELATED, nfe))) for nfe in (9, 3, 1)}
     transport = [whole(mean([runs[-1]], s, 1)) for runs in (SHORT, LONG) for s in (GAUSSIAN, PAST)]
     door = {nfe: {s: whole(solved("door_20000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 3, 1)}
     rows = read_played("door_20000")
@@ -117,7 +117,7 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
             f"{span(short)} points less often at one step after 10,000 iterations",
             f"succeeds {correlated[9]} points more often at nine steps ({pair(LONG, CORRELATED, 9)}) "
-            f"and {correlated[3]} at three, {-correlated[1]} less often at one",
+            f"and {correlated[3]} at three, {correlated[1]} less often at one",
         ],
         "which_source.md": [
             f"{span(joints)}% at three steps",
@@ -149,7 +149,7 @@ def sentences() -> dict[str, list[str]]:
             f"with 206 ({pair(['pusht_206_80000'], PAST)}, one seed)",
         ],
         "results.md": [
-            f"At one step WP-Past solves {transport[3]}% on transport and the Gaussian source "
+            f"There WP-Past solves {transport[3]}% on transport and the Gaussian source "
             f"{transport[2]}, where they solve {transport[1]} and {transport[0]} after 10,000",
             f"({pair(LONG, CORRELATED, 9)} at nine, {pair(LONG, CORRELATED, 3)} at three, "
             f"{pair(LONG, CORRELATED, 1)} at one)",

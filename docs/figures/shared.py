@@ -49,12 +49,16 @@ def with_own_noise(rows: DataFrame) -> DataFrame:
     return rows[rows["noise"] == rows.groupby("source")["noise"].transform("max")]
 
 
-def read_cells(names: Iterable[str]) -> DataFrame:
-    """Return success at the own noise of each source, a row per task, demonstrations, source and NFE.
+def read_cells(names: Iterable[str], common_seeds: bool = False) -> DataFrame:
+    """Return success at the own noise of each source, a row per run, task, source and NFE.
 
-    Its columns ``success`` (percent) and ``total`` are over all seeds, whose number is in ``seeds``.
+    Its columns ``success`` (percent) and ``total`` are over all seeds, or over those that all runs have;
+    ``seeds`` is their number.
     """
-    rows = concat([with_own_noise(read_played(name)).assign(run=name) for name in names])
+    runs = [with_own_noise(read_played(name)).assign(run=name) for name in names]
+    rows = concat(runs)
+    if common_seeds:
+        rows = rows[rows["seed"].isin(set.intersection(*(set(run["seed"]) for run in runs)))]
     keys = ["run", "task", "data", "iterations", "source", "nfe"]
     cells = rows.groupby(keys, as_index=False, sort=False).agg(
         successes=("successes", "sum"), total=("episodes", "sum"), seeds=("seed", "nunique")
@@ -83,13 +87,13 @@ def figure(width: float, height: float, columns: int, title: str, rows: int = 1)
     return picture, list(picture.subplots(rows, columns, squeeze=False).flat)
 
 
-def save(picture: Figure, name: str, columns: int = 2) -> None:
+def save(picture: Figure, name: str) -> None:
     """Write the picture with one legend below."""
     shown = [pair for axis in picture.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in reversed(shown)}
     labels = sorted(handles, key=[label for _, label in shown].index)
     picture.legend(
-        [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, frameon=False
+        [handles[label] for label in labels], labels, loc="outside lower center", ncols=2, frameon=False
     )
     picture.savefig(OUT / f"{name}.svg", **SVG)
 
