@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pandas import DataFrame
-from shared import GAUSSIAN, SOURCES, read_played, shown_sources
+from pandas import DataFrame, read_json
+from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
 
 from lab.statistics import chosen_elsewhere
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
 
-PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the table of a run's rows in a page: by NFE and noise, by sigma, or by chunk length."""
+PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk|curvature) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the table of a run in a page: by NFE and noise, sigma, or chunk length, or of curvature."""
 
 
 def played_table(name: str) -> str:
@@ -95,6 +96,21 @@ def study_table(column: str, name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def curvature_table(name: str) -> str:
+    """Return curvature relative to the Gaussian source in Markdown, at the mean of the data."""
+    rows = read_json(DATA / f"{name}.jsonl", lines=True).query("mean == 'training'")
+    text = ["| | whole | executed, 95% interval | per squared speed | one Euler step |"]
+    text.append("|---" * 5 + "|")
+    for _, row in rows[rows["prior"] != GAUSSIAN].iterrows():
+        source = f"{row['prior']},{row['options']}" if row["options"] else row["prior"]
+        interval = f"[{row['ratio_executed_low']:.2f}, {row['ratio_executed_high']:.2f}]"
+        numbers = [row["ratio"], row["ratio_executed"], row["ratio_relative"], row["ratio_one_step"]]
+        cells = [f"{number:.2f}" for number in numbers]
+        cells[1] += f" {interval}"
+        text.append(f"| {SOURCES[source][0]} | {' | '.join(cells)} |")
+    return "\n".join(text) + "\n"
+
+
 def with_tables(page: str, tables: Sequence[str]) -> str:
     """Return a page with its tables, in their order, and those of the runs whose rows it names."""
     if len(places := TABLE.findall(page)) != len(tables):
@@ -103,7 +119,8 @@ def with_tables(page: str, tables: Sequence[str]) -> str:
 
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
-        return f"{kind} {name}{end}{played_table(name) if kind == 'rows' else study_table(kind, name)}"
+        drawn = {"rows": played_table, "curvature": curvature_table}.get(kind, partial(study_table, kind))
+        return f"{kind} {name}{end}{drawn(name)}"
 
     page = TABLE.sub(lambda _: next(texts), page)
     return PLAYED.sub(table_of, page)
