@@ -57,7 +57,8 @@ def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
     for run in runs:
         for nfe in nfes or (9, 3, 1):
             both = [
-                played(run, name, nfe).set_index("seed")["solved"].sort_index() for name in (source, GAUSSIAN)
+                played(run, name, nfe).set_index(["task", "seed"])["solved"].sort_index()
+                for name in (source, GAUSSIAN)
             ]
             for outcomes, base in zip(*both, strict=True):
                 won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
@@ -115,6 +116,7 @@ def sentences() -> dict[str, list[str]]:
             f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
             f"({best_mean[PAST]} and {best_mean[GAUSSIAN]}%)",
             f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
+            f"(WP-Past with 25: {pair(GROUPS[TWENTY_FIVE], PAST, 1).replace(' :', ' won,')} lost)",
             f"{span(short)} points less often at one step after 10,000 iterations",
             f"succeeds {correlated[9]} points more often at nine steps ({pair(LONG, CORRELATED, 9)}) "
             f"and {correlated[3]} at three, {correlated[1]} less often at one",
