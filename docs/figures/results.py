@@ -117,8 +117,9 @@ def iterations() -> None:
         means = cells.groupby(["source", "iterations"], as_index=False).agg(
             {"success": "mean", "total": "max"}
         )
+        means["iterations"] //= 1_000
         lines(axis, means, "iterations", sorted(means["iterations"].unique()))
-        finish(axis, name.replace(", ", ",\n"), xlabel="training iterations of batch 128", xlim=(8_000, 1e5))
+        finish(axis, name.replace(", ", ",\n"), xlabel="thousand iterations of batch 128", xlim=(8, 100))
     picture.supylabel("success in percent, mean of NFE 9, 3 and 1, 95% interval", fontsize=10)
     save(picture, "iterations")
 
