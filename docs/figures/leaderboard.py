@@ -15,15 +15,12 @@ from pathlib import Path
 import numpy as np
 from pages import own_best, write
 from pandas import DataFrame, concat
-from results import GROUPS
+from results import GROUPS, WARM
 from scipy.stats import rankdata
 from shared import (
-    CORRELATED,
     DOCS,
     GAUSSIAN,
     OUT,
-    PAST,
-    PREVIEW,
     SOURCES,
     WIDTH,
     at_nine_three_one,
@@ -133,7 +130,7 @@ def table() -> str:
 
 def readme_table() -> str:
     """Return success of four sources on human and scripted demonstrations in Markdown, at NFE 9 / 3 / 1."""
-    sources = (GAUSSIAN, PAST, PREVIEW, CORRELATED)
+    sources = (GAUSSIAN, *WARM)
     people = standings().assign(success=lambda frame: frame["mean"])
     groups = {"human": people} | {f"scripted, {name}": read_cells(runs) for name, runs in GROUPS.items()}
     text = [f"| demonstrations | {' | '.join(SOURCES[source][0] for source in sources)} |"]

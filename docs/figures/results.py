@@ -40,14 +40,13 @@ from lab.paper import PAPER_SUCCESS, STATE
 
 PAGE = DOCS / "results.md"
 TEN, TWENTY_FIVE, MANY = "10", "25", "300 of six operators"
-GROUPS = {  # scripted demonstrations, and the rows of their runs
-    TEN: ("scripted_10",),
-    TWENTY_FIVE: ("scripted_25",),
-    MANY: ("square_mh_80000", "transport_mh_80000"),
-}
+SHORT = "square_mh_10000", "transport_mh_10000"
+LONG = "square_mh_80000", "transport_mh_80000"
+GROUPS = {TEN: ("scripted_10",), TWENTY_FIVE: ("scripted_25",), MANY: LONG}
+"""Scripted demonstrations, and the rows of their runs."""
 LENGTHS = {  # demonstrations whose runs differ in the length of training
-    "square, 300 of six operators": ("square_mh_10000", "square_mh_80000"),
-    "transport, 300 of six operators": ("transport_mh_10000", "transport_mh_80000"),
+    f"square, {MANY}": (SHORT[0], LONG[0]),
+    f"transport, {MANY}": (SHORT[1], LONG[1]),
     "door, 25 human": ("door_20000", "door_80000"),
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),
 }
@@ -156,7 +155,7 @@ def paper_table() -> str:
 
     names = GAUSSIAN, PAST, PREVIEW
     text = ["| | | Gaussian source | WP-Past | WP-Preview |", "|---|---|---|---|---|"]
-    rows = read_cells(run for name, runs in LENGTHS.items() if "operators" in name for run in runs)
+    rows = read_cells(SHORT + LONG)
     for (task, style, observations), paper in PAPER_SUCCESS.items():
         ours = rows[(rows["task"] == task) & (rows["data"] == style)]
         if observations == STATE and len(ours):

@@ -11,10 +11,8 @@ import numpy as np
 from leaderboard import DOOR, pairs, standings, trials
 from pages import own_best
 from pandas import DataFrame
-from results import GROUPS, LENGTHS, TEN, TWENTY_FIVE, WARM
+from results import GROUPS, LONG, SHORT, TEN, TWENTY_FIVE, WARM
 from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
-
-SHORT, LONG = zip(*(runs for name, runs in LENGTHS.items() if "operators" in name), strict=True)
 
 
 def whole(number: float) -> int:
