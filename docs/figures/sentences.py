@@ -63,6 +63,11 @@ def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
     return f"{won} : {lost}"
 
 
+def in_words(pair_of_counts: str) -> str:
+    """Return ``a : b`` as ``a won, b lost``."""
+    return pair_of_counts.replace(" :", " won,") + " lost"
+
+
 def mean(runs: Iterable[str], source: str, nfe: int) -> float:
     """Return the mean success of a source over the tasks of some runs, in percent."""
     rows = read_cells(runs)
@@ -114,9 +119,10 @@ def sentences() -> dict[str, list[str]]:
             f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
             f"({best_mean[PAST]} and {best_mean[GAUSSIAN]}%)",
             f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
-            f"(WP-Past with 25: {pair(GROUPS[TWENTY_FIVE], PAST, 1).replace(' :', ' won,')} lost)",
+            f"(WP-Past with 25: {in_words(pair(GROUPS[TWENTY_FIVE], PAST, 1))})",
             f"{span(short)} points less often at one step after 10,000 iterations",
-            f"succeeds {correlated[9]} points more often at nine steps ({pair(LONG, CORRELATED, 9)}) "
+            f"succeeds {correlated[9]} points more often at nine steps "
+            f"({in_words(pair(LONG, CORRELATED, 9))}) "
             f"and {correlated[3]} at three, {correlated[1]} less often at one",
         ],
         "which_source.md": [
