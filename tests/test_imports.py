@@ -20,7 +20,7 @@ def ran(code, **environment):
     return done
 
 
-OPTIONAL = ("robosuite", "lerobot", "h5py", "matplotlib", "scipy", "numba", "gymnasium", "mujoco", "tyro")
+OPTIONAL = ("robosuite", "lerobot", "h5py", "matplotlib", "scipy", "numba", "gymnasium", "mujoco")
 
 BLOCK = """
 import sys

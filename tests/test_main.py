@@ -58,6 +58,19 @@ def test_evaluate_plays_the_same_episodes(saved, capsys):
     assert f"state ({TASKS['lift'].observation_dim},)" in said
 
 
+def test_evaluate_plays_without_noise_at_temperature_0(saved, monkeypatch):
+    import warmprior.training.evaluation as evaluation
+
+    played = []
+    monkeypatch.setattr(
+        evaluation, "evaluate", lambda actor, *args, **options: played.append(actor) or [saved[1]]
+    )
+    for words in ("", "--temperature 0 --grid dense-jump"):
+        assert main(["evaluate", str(saved[0]), "--nfe", "1", *words.split()]) == 0
+    assert [actor.sampling.temperature for actor in played] == [None, 0]
+    assert str(played[1].sampling.grid) != str(played[0].sampling.grid)
+
+
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
 def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     av = pytest.importorskip("av")
@@ -150,10 +163,10 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("words", "fact"),
-    [("--prior nobodys", "'nobodys'"), ("missing.hdf5", "missing.hdf5"), ("--chunk 0", "chunk_length")],
+    [("--prior nobodys", "'nobodys'"), ("", "missing.hdf5"), ("--chunk 0", "chunk_length")],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, fact):
-    said = refused(["train", *words.split(), "--out", str(tmp_path / "out")], capsys)
+    said = refused(["train", "missing.hdf5", *words.split(), "--out", str(tmp_path / "out")], capsys)
     assert not missing(said, fact)
     assert not (tmp_path / "out").exists()
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+import tyro
 from tensordict import TensorDict, TensorDictBase
 
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers, given
+from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
@@ -25,25 +26,39 @@ from warmprior.training import NetworkOptions, Task, TrainingConfig, train_polic
 from warmprior.training.behaviour_cloning import policy_path
 from warmprior.transforms.window import window_transforms
 
+Imported = tyro.conf.UseAppendAction[
+    Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE")]
+]
+"""Modules that define a policy's own parts, each after its own ``--import``."""
 
-def _policy(args: argparse.Namespace) -> WarmPriorActor:
+Policy = Annotated[str, tyro.conf.arg(metavar="FOLDER")]
+
+
+def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPriorActor:
     from warmprior.training.saved import load_policy
 
-    for module in args.modules:
+    for module in modules:
         importlib.import_module(module)
-    return load_policy(args.folder, revision=args.revision)
+    return load_policy(folder, revision=revision)
 
 
-def info(args: argparse.Namespace) -> None:
-    """Print a summary of a saved policy."""
+def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = ()) -> None:
+    """Print a summary of a saved policy.
+
+    Args:
+        folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
+            Hugging Face hub
+        revision: branch, tag or commit of the repository (default: main)
+        modules: module that defines your own prior, start point or network; may be repeated
+    """
     from warmprior.deploy.observation import observation_shapes
     from warmprior.envs.description import environment_name
     from warmprior.training.saved import policy_config, policy_file
 
-    actor = _policy(args)
+    actor = _policy(folder, revision, modules)
     config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
     shapes = observation_shapes(actor)
-    written = policy_file(args.folder, revision=args.revision).get("warmprior", "of an unknown version")
+    written = policy_file(folder, revision=revision).get("warmprior", "of an unknown version")
     for name, value in {
         "prior": actor.prior,
         "start": actor.start or "the source",
@@ -57,78 +72,122 @@ def info(args: argparse.Namespace) -> None:
         print(f"{name:12} {value}")
 
 
-def evaluate(args: argparse.Namespace) -> None:
-    """Play episodes with a saved policy, without a dataset."""
+def push(
+    folder: Policy,
+    repository: Annotated[str, tyro.conf.arg(metavar="USER/NAME")],
+    /,
+    *,
+    card: Path | None = None,
+    private: bool = False,
+    licence: str | None = None,
+    dry_run: bool = False,
+    revision: str | None = None,
+    modules: Imported = (),
+) -> None:
+    """Upload a saved policy to the Hugging Face hub, with a model card.
+
+    Args:
+        folder: folder of the policy, such as .../policy_010000
+        repository: user/name of the repository, created if needed
+        card: file with the model card, as benchmarks/card.py writes it (default: generated)
+        private: make the repository private if it is created
+        licence: licence of the policy in the hub's spelling, such as mit
+        dry_run: print the card and upload nothing
+        revision: branch of the repository (default: main)
+        modules: module that defines your own prior, start point or network; may be repeated
+    """
+    from warmprior.training.card import model_card
+    from warmprior.training.saved import check_repository, push_policy
+
+    check_repository(repository)
+    if not Path(folder).is_dir():
+        raise FileNotFoundError(f"no policy at {folder}: there is no such folder")
+    actor = _policy(folder, None, modules)  # the revision is the repository's, not the folder's
+    text = card.read_text() if card else model_card(actor, repository=repository, licence=licence)
+    if dry_run:
+        print(text)
+        return
+    commit = push_policy(actor, repository, card=text, private=private or None, revision=revision)
+    print(f"{repository}: commit {commit}")
+
+
+def evaluate(
+    folder: Policy,
+    /,
+    *,
+    episodes: int = 50,
+    nfe: tuple[int, ...] = (),
+    temperature: float | None = None,
+    grid: str | None = None,
+    first_seed: int = EVALUATION_SEED,
+    policy_seed: int = 0,
+    play_on: bool = False,
+    video: Path | None = None,
+    revision: str | None = None,
+    modules: Imported = (),
+) -> None:
+    """Play episodes with a saved policy, without a dataset.
+
+    Args:
+        folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
+            Hugging Face hub
+        episodes: number of episodes
+        nfe: network evaluations per chunk, one or several values (default: the policy's)
+        temperature: factor on the noise of the source, from 0 on (default: the policy's, or 1)
+        grid: times of the steps: uniform, dense-jump or dense-jump:TIME (default: the policy's)
+        first_seed: simulator seed of the first episode
+        policy_seed: seed of the source samples
+        play_on: play on after success, up to the time limit
+        video: MP4 file to write of the first episode; needs EGL or OSMesa, and PyAV
+        revision: branch, tag or commit of the repository (default: main)
+        modules: module that defines your own prior, start point or network; may be repeated
+    """
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
     from warmprior.training.video import check_video, record_filmstrip
 
-    check_whole_numbers(**{"--episodes": args.episodes})
-    actor = _policy(args)
-    nfes = [actor.sampling.evaluations(nfe) for nfe in args.nfe or [None]]
-    if args.grid is not None:
-        actor = actor.replace(grid=args.grid)
-    if args.video is not None:  # before the episodes are played
-        check_video(args.video, actor)
-    options = {"terminate_on_success": not args.play_on}
+    check_whole_numbers(**{"--episodes": episodes})
+    actor = _policy(folder, revision, modules)
+    nfes = [actor.sampling.evaluations(n) for n in nfe or [None]]
+    actor = actor.replace(**given(temperature=temperature, grid=grid))
+    if video is not None:  # before the episodes are played
+        check_video(video, actor)
+    options = {"terminate_on_success": not play_on}
     env = environment_of(actor, **options)
     try:
-        for nfe in nfes:
-            episodes = play(
+        for n in nfes:
+            played = play(
                 actor,
                 env,
-                episodes=args.episodes,
-                first_seed=args.first_seed,
-                nfe=nfe,
-                policy_seed=args.policy_seed,
-                description=f"NFE {nfe}",
+                episodes=episodes,
+                first_seed=first_seed,
+                nfe=n,
+                policy_seed=policy_seed,
+                description=f"NFE {n}",
             )
-            wins = sum(episode.success for episode in episodes)
-            low, high = success_posterior(wins, len(episodes)).interval(0.95)
-            steps = sum(episode.steps for episode in episodes) / len(episodes)
+            wins = sum(episode.success for episode in played)
+            low, high = success_posterior(wins, len(played)).interval(0.95)
+            steps = sum(episode.steps for episode in played) / len(played)
             print(
-                f"NFE {nfe}: {wins} of {len(episodes)} episodes solved ({100 * wins / len(episodes):.1f}%; "
+                f"NFE {n}: {wins} of {len(played)} episodes solved ({100 * wins / len(played):.1f}%; "
                 f"95% of the posterior between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control "
                 "steps on average"
             )
     finally:
         env.close()
-    if args.video is not None:
-        video = record_filmstrip(
+    if video is not None:
+        filmed = record_filmstrip(
             actor,
-            seed=args.first_seed,
+            seed=first_seed,
             nfe=nfes[-1],
-            policy_seed=args.policy_seed,
+            policy_seed=policy_seed,
             frames=1,
             size=256,
-            video=args.video,
+            video=video,
             **options,
         )
-        print(f"{args.video}: episode {args.first_seed}, {'' if video.success else 'not '}solved")
-
-
-def push(args: argparse.Namespace) -> None:
-    """Upload a saved policy to the Hugging Face hub, with a model card."""
-    from warmprior.training.card import model_card
-    from warmprior.training.saved import check_repository, push_policy
-
-    check_repository(args.repository)
-    branch, args.revision = args.revision, None  # the revision is the repository's, not the folder's
-    if not Path(args.folder).is_dir():
-        raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")
-    actor = _policy(args)
-    card = (
-        args.card.read_text()
-        if args.card
-        else model_card(actor, repository=args.repository, licence=args.licence)
-    )
-    if args.dry_run:
-        print(card)
-        return
-    private = args.private or None
-    commit = push_policy(actor, args.repository, card=card, private=private, revision=branch)
-    print(f"{args.repository}: commit {commit}")
+        print(f"{video}: episode {first_seed}, {'' if filmed.success else 'not '}solved")
 
 
 @dataclass(frozen=True)
@@ -162,13 +221,24 @@ class Data:
     horizon: int | None = None
 
 
-@dataclass(frozen=True)
-class Train:
-    """Train a policy on demonstrations: python -m warmprior train PLACE [OPTIONS].
+def train(
+    place: Annotated[str, tyro.conf.arg(metavar="PLACE")],
+    /,
+    *,
+    network: NetworkOptions,
+    training: TrainingConfig,
+    data: Data,
+    prior: str = "past,correlation=0.5",
+    chunk: int = 8,
+    nfe: int = DEFAULT_NFE,
+    held_out: int | None = None,
+    out: Path = Path("policies"),
+    device: str = "cpu",
+) -> None:
+    """Train a policy on demonstrations, without playing episodes.
 
-    PLACE is a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME.
-
-    Attributes:
+    Args:
+        place: a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
         network: options of the velocity network
         training: options of the recipe
         data: options of the demonstrations
@@ -178,42 +248,13 @@ class Train:
         nfe: network evaluations per chunk, saved with the policy
         held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
             tenth if no environment is known, else none)
-        out: folder of training runs, in which an interrupted one continues (default: policies)
+        out: folder of training runs, in which an interrupted one continues
         device: device of the network, such as cuda
     """
-
-    network: NetworkOptions
-    training: TrainingConfig
-    data: Data
-    prior: str = "past,correlation=0.5"
-    chunk: int = 8
-    nfe: int = DEFAULT_NFE
-    held_out: int | None = None
-    out: Path | None = None
-    device: str = "cpu"
-
-
-def train(args: argparse.Namespace) -> None:
-    """Train a policy on demonstrations, without playing episodes."""
-    import tyro
-
     from warmprior.envs.description import is_registered
 
-    place, *rest = args.options or [""]
-    if not place or place.startswith("-"):
-        place, rest = "", args.options
-    options = tyro.cli(
-        tyro.conf.OmitArgPrefixes[Train],
-        prog="python -m warmprior train PLACE",
-        args=rest,
-        default=Train(NetworkOptions(), TrainingConfig(), Data()),
-    )
-    prior = make(Prior, options.prior, options.chunk)
-    if not place:
-        raise ValueError(
-            "name the demonstrations first: train FILE.hdf5, lerobot:FOLDER, lerobot:USER/NAME or minari:NAME"
-        )
-    chosen, steps = asdict(options.data), options.network.observation_steps
+    source, options = make(Prior, prior, chunk), prior.split(",")[1:]
+    chosen, steps = asdict(data), network.observation_steps
     whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
     recorded: Any = whole.environment
     playable = recorded is not None
@@ -227,21 +268,19 @@ def train(args: argparse.Namespace) -> None:
             print(f"no episodes can be played here, so the policy is only trained: {missing}")
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
-    task, left_out = whole.split(tenth if options.held_out is None else options.held_out)
-    source = ",".join([prior.name, *options.prior.split(",")[1:]])
-    name = f"{task.name}-{task.style}-{source}-seed{options.training.seed}"
-    folder = (options.out or Path("policies")) / name
+    task, left_out = whole.split(tenth if held_out is None else held_out)
+    name = f"{task.name}-{task.style}-{','.join([source.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,
-        prior,
-        folder,
-        nfe=options.nfe,
-        network=options.network,
-        training=options.training,
-        device=options.device,
+        source,
+        out / name,
+        nfe=nfe,
+        network=network,
+        training=training,
+        device=device,
         description=name,
     )
-    saved = policy_path(folder, options.training.iterations)
+    saved = policy_path(out / name, training.iterations)
     if left_out is not None:
         spread = float(left_out["action"].var(0, correction=0).mean())
         number = count - task.facts["demonstrations"]
@@ -249,8 +288,8 @@ def train(args: argparse.Namespace) -> None:
             f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
             f"the mean action has {spread:.4f}:"
         )
-        for nfe, error in errors_of(actor, left_out, steps, (1, 3, 9, options.nfe)).items():
-            print(f"  NFE {nfe}: {error:.4f}")
+        for n, error in errors_of(actor, left_out, steps, (1, 3, 9, nfe)).items():
+            print(f"  NFE {n}: {error:.4f}")
     if playable:
         print(f"to play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
     print(saved)
@@ -268,106 +307,59 @@ def errors_of(
     return action_error(actor, batch, nfes=nfes)
 
 
-def convert(args: argparse.Namespace) -> None:
-    """Write a robomimic HDF5 file as a LeRobotDataset v3."""
+def convert(
+    file: Path,
+    folder: Path,
+    /,
+    *,
+    images: Literal["image", "video"] | None = None,
+    observation_keys: tuple[str, ...] | None = None,
+    demonstrations: int | None = None,
+) -> None:
+    """Write a robomimic HDF5 file as a LeRobotDataset v3.
+
+    Args:
+        file: robomimic HDF5 file
+        folder: folder to write, which must not exist
+        images: include the file's images as lossless pictures (image), or as lossy, smaller videos (video)
+        observation_keys: observations to write (default: the task's)
+        demonstrations: number of demonstrations, from the first on (default: all)
+    """
     from warmprior.data import convert_robomimic
 
-    chosen = {"demos": args.demonstrations, "observation_keys": args.observation_keys}
-    print(convert_robomimic(args.file, args.folder, images=args.images, **chosen))
+    print(
+        convert_robomimic(
+            file, folder, images=images, observation_keys=observation_keys, demos=demonstrations
+        )
+    )
 
 
-def observe(args: argparse.Namespace) -> None:
-    """Replay raw recordings of robosuite, and write a robomimic file with observations."""
+def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> None:
+    """Replay raw recordings of robosuite, and write a robomimic file with observations.
+
+    Args:
+        file: recording, such as demo.hdf5 of robosuite's collect_human_demonstrations
+        out: robomimic HDF5 file to write, which must not exist
+        demonstrations: number of demonstrations, from the first on (default: all)
+    """
     from warmprior.data import observe_recordings
 
-    print(observe_recordings(args.file, args.out, demos=args.demonstrations))
+    print(observe_recordings(file, out, demos=demonstrations))
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the commands and their options."""
-    parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
-    written = f"warmprior {version('warmprior')}"
-    parser.add_argument("--version", action="version", version=written, help="print the version and exit")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def command(run: Callable[[argparse.Namespace], None]) -> Callable[..., Any]:
-        added = commands.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
-        added.set_defaults(run=run)
-        return added.add_argument
-
-    for run in (info, push, evaluate):
-        add = command(run)
-        place = "" if run is push else ", or user/name of a repository at the Hugging Face hub"
-        add("folder", help=f"folder of the saved policy, such as .../policy_010000{place}")
-        if run is push:
-            add("repository", help="user/name of the repository, created if needed")
-            add(
-                "--card",
-                type=Path,
-                help="file with the model card, as benchmarks/card.py writes it (default: generated)",
-            )
-            add("--private", action="store_true", help="make the repository private if it is created")
-            add("--licence", help="licence of the policy in the hub's spelling, such as mit")
-            add("--dry-run", action="store_true", help="print the card and upload nothing")
-        add("--revision", help="branch, tag or commit of the repository (default: main)")
-        add(
-            "--import",
-            dest="modules",
-            action="append",
-            default=[],
-            metavar="MODULE",
-            help="module that defines your own prior, start point or network; may be repeated",
-        )
-    from warmprior.envs.tasks import EVALUATION_SEED
-
-    add("--episodes", type=int, default=50, help="number of episodes (default: %(default)s)")
-    add(
-        "--nfe",
-        type=int,
-        nargs="+",
-        help="network evaluations per chunk, one or several values (default: the policy's)",
-    )
-    add("--grid", help="times of the steps: uniform, dense-jump or dense-jump:TIME (default: the policy's)")
-    add(
-        "--first-seed",
-        type=int,
-        default=EVALUATION_SEED,
-        help="simulator seed of the first episode (default: %(default)s)",
-    )
-    add("--policy-seed", type=int, default=0, help="seed of the source samples (default: %(default)s)")
-    add("--play-on", action="store_true", help="play on after success, up to the time limit")
-    add("--video", type=Path, help="MP4 file to write of the first episode; needs EGL or OSMesa, and PyAV")
-
-    # tyro parses the options of train, --help included.
-    added = commands.add_parser("train", help=train.__doc__, add_help=False, prefix_chars="\0")
-    added.set_defaults(run=train)
-    added.add_argument("options", nargs=argparse.REMAINDER)
-
-    add = command(convert)
-    add("file", type=Path, help="robomimic HDF5 file")
-    add("folder", type=Path, help="folder to write, which must not exist")
-    kept = {"action": "store_const", "dest": "images"}
-    add("--images", **kept, const="image", help="include the file's images as lossless pictures")
-    add(
-        "--video",
-        **kept,
-        const="video",
-        help="include the file's images as lossy, smaller videos",
-    )
-    add("--observation-keys", nargs="+", help="observations to write (default: the task's)")
-    add("--demonstrations", type=int, help="number of demonstrations, from the first on (default: all)")
-
-    add = command(observe)
-    add("file", type=Path, help="recording, such as demo.hdf5 of robosuite's collect_human_demonstrations")
-    add("out", type=Path, help="robomimic HDF5 file to write, which must not exist")
-    add("--demonstrations", type=int, help="number of demonstrations, from the first on (default: all)")
-    return parser
+COMMANDS = (info, push, evaluate, train, convert, observe)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Run command-line arguments, and return the exit code. User errors are reported in one line."""
-    args = make_parser().parse_args(argv)
-    return run_script(lambda: args.run(args), "warmprior")
+    argv = sys.argv[1:] if argv is None else argv
+    if list(argv) == ["--version"]:
+        print(f"warmprior {version('warmprior')}")
+        return 0
+    commands: dict[str, Any] = {command.__name__: command for command in COMMANDS}
+    options: Any = {"prog": "python -m warmprior", "description": __doc__, "args": argv}
+    options["config"] = (tyro.conf.OmitArgPrefixes,)  # --iterations, not --training.iterations
+    return run_script(lambda: tyro.extras.subcommand_cli_from_dict(commands, **options), "warmprior")
 
 
 if __name__ == "__main__":
