@@ -4,10 +4,11 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import ActionScaling, Compose, ObservationNorm, SerialEnv, StepCounter, TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
-from warmprior import ChunkStep, ObservationStack
+from warmprior import ChunkStep, Normalizer, ObservationStack, PastPrior, policy_transforms
 
 H = 5
 
@@ -65,6 +66,17 @@ def test_chunks_lead_to_what_single_steps_lead_to(lengths, execute, steps):
 
 def late_of(env):
     return env.transform[-1]._inner_step()[1]
+
+
+def test_the_transforms_of_a_normalised_policy_wait():
+    """A camera would otherwise render at every step."""
+    data = TensorDict({"observation": torch.rand(9, 4), "action": torch.rand(9, ACTION_DIM)}, [9])
+    transforms = policy_transforms(PastPrior(H), normalizer=Normalizer.fit(data, ("observation", "action")))
+    env = TransformedEnv(CountingEnv(9))
+    for transform in transforms:
+        env.append_transform(transform.clone())
+    (chunk,) = [t for t in env.transform if isinstance(t, ChunkStep)]
+    assert chunk._inner_step()[1] is not None
 
 
 class Subclass(ObservationStack):

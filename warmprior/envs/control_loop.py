@@ -15,7 +15,6 @@ import numpy as np
 
 from warmprior.checks import check_choice, check_shape
 from warmprior.envs.simulator import isolated_numpy_seed
-from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
 
 
@@ -173,9 +172,6 @@ def _osc_torques(
 
 Observations = dict[str, np.ndarray]
 
-OBJECT_POSES = {"Lift", "NutAssemblySquare", "PickPlaceCan", "Stack", "ToolHang", "TwoArmTransport"}
-"""The environments whose ``"object"`` observation depends only on positions."""
-
 
 class StepLoop:
     """A loop that steps a robosuite environment with ``env.step`` and reads robomimic's observations.
@@ -289,9 +285,6 @@ class ControlLoop(StepLoop):
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
         super().__init__(env, keys)
-        poses = low_dim_keys(len(env.robots))
-        #: True if :meth:`look_back` returns all observations.
-        self.looks_back = type(env).__name__ in OBJECT_POSES and not {*self._names.values()}.difference(poses)
 
     def _bind(self) -> None:
         super()._bind()
@@ -304,11 +297,6 @@ class ControlLoop(StepLoop):
 
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
         """Advance one control step; see :meth:`StepLoop.step`."""
-        success = self.advance(action)
-        return self._observations_here(), success
-
-    def advance(self, action: np.ndarray) -> bool:
-        """Advance one control step without observing; return True if the task is solved."""
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         check_shape("action", action, (env.action_dim,))
         for substep in range(self._substeps):
@@ -338,22 +326,8 @@ class ControlLoop(StepLoop):
             mujoco.mj_step2(model, data)
         env.timestep += 1
         env.cur_time += env.control_timestep
-        return bool(env._check_success())
-
-    def _observations_here(self) -> Observations:
+        success = bool(env._check_success())
         # Poses belong to the last substep's start until the kinematics are brought up to date.
-        self._mujoco.mj_kinematics(self._model, self._data)
-        self._mujoco.mj_comPos(self._model, self._data)
-        return self.observations(refresh=True)
-
-    def look_back(self, states: Sequence[np.ndarray]) -> list[Observations]:
-        """Return the observations after the last calls of :meth:`advance`, from :meth:`state` after each.
-
-        Only poses can be recovered. The first observations may be wrong, because sensors of objects relative
-        to the gripper read poses that were cached a step before.
-        """
-        data, observations = self._data, []
-        for state in states:
-            data.qpos[:], data.qvel[:] = np.split(state[1:], [self._model.nq])
-            observations.append(self._observations_here())
-        return observations
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        return self.observations(refresh=True), success

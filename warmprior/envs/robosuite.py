@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -200,10 +199,6 @@ class RobosuiteEnv(EnvBase):
 
     def _make_specs(self, env: Any) -> None:
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
-        self._late: ControlLoop | None = None  # the loop, if it can observe afterwards
-        if isinstance(self._loop, ControlLoop) and self._loop.looks_back:
-            others = self.from_pixels or self.sim_state or self.eef_pose
-            self._late = None if others else self._loop
         self._renderers = EnvRenderers(env, fast=self.fast_rendering)
         if self.from_pixels:
             require_rendering()
@@ -260,58 +255,23 @@ class RobosuiteEnv(EnvBase):
         out_of_time = self.horizon is not None and self._elapsed >= self.horizon
         return success, terminated, out_of_time and not terminated, terminated or out_of_time
 
-    def _tell(self, flags: Sequence[_Flags], measured: Collection[dict[str, Any]]) -> list[TensorDictBase]:
-        """Return a result per step; the last ones have observations."""
-        # Whole arrays become tensors and are split, which is faster than a small tensor per entry and step.
-        bits = np.array(flags)
-        booleans = iter(torch.from_numpy(bits.reshape(-1, 1)).unbind(0))
-        rewards = torch.from_numpy(bits[:, :1].astype(np.float32)).unbind(0)
-        entries: list[dict[str, Any]] = [
-            {"reward": reward, **{name: next(booleans) for name in _FLAGS}} for reward in rewards
-        ]
-        for entry, values in zip(entries[len(flags) - len(measured) :], measured, strict=True):
-            for key, value in values.items():
-                nested = isinstance(value, dict)
-                entry[key] = TensorDict(value) if nested else torch.from_numpy(value)
+    def _tell(self, flags: _Flags, observations: Mapping[str, np.ndarray]) -> TensorDictBase:
+        """Return the result of a step."""
+        entry: dict[str, Any] = {"reward": torch.tensor([float(flags[0])])}
+        entry |= {name: torch.tensor([flag]) for name, flag in zip(_FLAGS, flags, strict=True)}
+        for key, value in self._measure(observations).items():
+            entry[key] = TensorDict(value) if isinstance(value, dict) else torch.from_numpy(value)
         # The constructor's checks are skipped, because they take longer than all of the above.
-        results = [TensorDict._new_unsafe(entry, batch_size=torch.Size([])) for entry in entries]
-        return results if self.device is None else [r.to(self.device) for r in results]
+        result = TensorDict._new_unsafe(entry, batch_size=torch.Size([]))
+        return result if self.device is None else result.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         observations = self._loop.reset(self.episode_seed)
         self._episode += 1
         self._elapsed = 0
-        (result,) = self._tell([(False, False, False, False)], [self._measure(observations)])
-        return result.exclude("reward")
+        return self._tell((False, False, False, False), observations).exclude("reward")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        (result,) = self.control_steps(tensordict.get(keys.ACTION)[None], 1)
-        return result
-
-    def control_steps(self, actions: torch.Tensor, keep: int) -> list[TensorDictBase]:
-        """Take up to ``n`` control steps until the episode ends, and return their results.
-
-        :class:`~warmprior.ChunkStep` executes chunks with it if no transform and no subclass's ``_step`` must
-        see every step. ``actions`` are ``[n, d_a]``, ``n >= 1``. Only the last ``keep`` results, at least 1,
-        have observations; the others have only reward, ``"success"`` and done flags. Observations other than
-        poses are measured at every step.
-        """
-        check_whole_numbers(keep=keep)
-        rows = actions.detach().cpu().double().unbind(0)
-        flags: list[_Flags] = []
-        states: list[np.ndarray] = []
-        measured = deque[dict[str, Any]](maxlen=keep)
-        for action in rows:
-            if self._late is not None:
-                success = self._late.advance(action.numpy())
-                states.append(self._late.state())
-            else:
-                observations, success = self._loop.step(action.numpy())
-                measured.append(self._measure(observations))
-            flags.append(self._count(success))
-            if flags[-1][-1]:
-                break
-        if self._late is not None:
-            # One more than needed, because the first may be wrong (see ControlLoop.look_back).
-            measured.extend(map(self._measure, self._late.look_back(states[-keep - 1 :])))
-        return self._tell(flags, measured)
+        action = tensordict.get(keys.ACTION).detach().cpu().double().numpy()
+        observations, success = self._loop.step(action)
+        return self._tell(self._count(success), observations)

@@ -16,7 +16,7 @@ from warmprior import keys
 from warmprior.checks import check_keys, check_shape
 
 
-class _FloatNorm(ObservationNorm):
+class FloatNorm(ObservationNorm):
     """TorchRL's transform, for integers and flags too: its specs would keep their type, and buffers cut."""
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ class Normalizer(nn.Module):
             if key == action_key:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
-                transforms.append(_FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
+                transforms.append(FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
         return transforms
 
     def config(self) -> dict[str, Any]:

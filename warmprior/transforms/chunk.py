@@ -22,6 +22,7 @@ from torchrl.envs.transforms import (
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers
+from warmprior.modules.normalize import FloatNorm
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
@@ -31,6 +32,7 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
     AbsoluteActions: lambda transform: 1,
     ActionScaling: lambda transform: 1,
     CameraImages: lambda transform: 1,
+    FloatNorm: lambda transform: 1,
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
 }
@@ -47,12 +49,10 @@ class LateTransforms:
 
     A decision of ``k`` control steps is read once, at its end; with a fast simulator, transforming all
     observations only to discard most of them would take most of the time. The result equals that of
-    transforming every step, bit for bit. The environment's own ``control_steps`` (see :class:`ChunkStep`) is
-    used if all actions can be inverted at once and only reward and flags of the first steps are read
-    (``brief``).
+    transforming every step, bit for bit.
     """
 
-    def __init__(self, step: InnerStep, action_key: NestedKey, brief: bool) -> None:
+    def __init__(self, step: InnerStep, action_key: NestedKey) -> None:
         self._step, self._action_key = step, action_key
         self._transforms = step.transforms
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
@@ -61,9 +61,6 @@ class LateTransforms:
         looking = (i for i, t in enumerate(self._transforms) if isinstance(t, AbsoluteActions))
         first = 1 + max(looking, default=-1)
         self._one_by_one, self._at_once = self._transforms[:first], self._transforms[first:]
-        self._control_steps: Callable[[Tensor, int], list[TensorDictBase]] | None = None
-        if brief and not self._one_by_one and not step.base.batch_size:
-            self._control_steps = _control_steps(step.base)
 
     @classmethod
     def of(
@@ -85,8 +82,7 @@ class LateTransforms:
         inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
         if written & needed or any(ends not in ([], [action_key]) for pair in inverse for ends in pair):
             return None
-        brief = {*base.reward_keys, *base.done_keys, keys.SUCCESS}
-        return cls(step, action_key, brief.issuperset(read))
+        return cls(step, action_key)
 
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
@@ -95,11 +91,7 @@ class LateTransforms:
 
         ``current`` becomes the input of the last step, in place; only that step's result is transformed.
         """
-        results, actions = [first], self._inverse(actions)
-        if self._control_steps is None:
-            results += self._steps(current, first, actions, reward_key)
-        elif len(actions) and not first.get("done").any():
-            results += self._control_steps(actions, self._reach)
+        results = [first, *self._steps(current, first, self._inverse(actions), reward_key)]
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
         return results
@@ -138,13 +130,6 @@ class LateTransforms:
         return before
 
 
-def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase]] | None:
-    """Return the environment's ``control_steps`` if one class defines it and ``_step``, else ``None``."""
-    owner = next((cls for cls in type(base).__mro__ if "control_steps" in vars(cls)), None)
-    same = owner is not None and type(base)._step is owner._step  # type: ignore[attr-defined]
-    return getattr(base, "control_steps", None) if same else None
-
-
 def update_input(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
     """Move a step's result into ``current``: a lean ``step_mdp``, in place and without the reward."""
     for key, value in next_tensordict.items():
@@ -179,12 +164,6 @@ class ChunkStep(EnvTransform):
     transforms are memoryless (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they
     run only at the steps that a chunk's last observation depends on. In a partial step, rows that are not
     stepped keep all observations.
-
-    An environment without batch dimensions may take all but a chunk's first step in one call, which
-    doubles the speed of :class:`~warmprior.envs.RobosuiteEnv`. The class
-    that defines ``_step`` must then define ``control_steps(actions, keep)``: it executes raw actions ``[n,
-    d_a]`` until the episode ends and returns one tensordict per step, the last ``keep`` complete, the earlier
-    ones with reward, flags and ``"success"`` only.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
