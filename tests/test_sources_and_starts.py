@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from lab.couplings import ReflowCoupling
 from lab.methods import Method
 from tests.errors import raises
 from tests.toy_env import Halfway, demonstrations
@@ -22,7 +23,6 @@ from warmprior import (
 from warmprior.history import cold_history
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import Registered
-from warmprior.objectives import ReflowCoupling
 from warmprior.rl import has_anchor
 from warmprior.training import BehaviourCloning, TrainingConfig
 

@@ -15,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
+from lab.memory_gain import memory_gain
 from lab.methods import Method
 from lab.options import MeasuredOptions
 from lab.policies import Policy
@@ -28,7 +29,6 @@ from warmprior.diagnostics import (
     branching_bound,
     curvature,
     encoded_windows,
-    memory_gain,
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history

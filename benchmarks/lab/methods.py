@@ -26,6 +26,7 @@ from typing import Any
 import torch
 
 from lab.bridge import BridgeCoupling
+from lab.couplings import OTCoupling, ReflowCoupling
 from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
 from lab.mip import SECOND, MIPCoupling, TwoStepCoupling
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
@@ -33,7 +34,7 @@ from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of
 from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
-from warmprior.objectives import Coupling, OTCoupling, ReflowCoupling
+from warmprior.objectives import Coupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
 

@@ -182,12 +182,8 @@ class Options:
                     f"{method.name} would weigh its second error a hundredfold: it needs preconditioning and "
                     "standardised errors"
                 )
-            l1, distilled = self.training.objective == "l1", self.training.self_distillation > 0
-            if distilled and not method.is_flow:
-                raise ValueError(f"--self-distillation needs a flow: leave out {method.name}")
-            if (l1 or distilled) and not method.is_straight:
-                option = "--objective l1" if l1 else "--self-distillation"
-                raise ValueError(f"{option} needs a straight path: leave out {method.name}")
+            if self.training.objective == "l1" and not method.is_straight:
+                raise ValueError(f"--objective l1 needs a straight path: leave out {method.name}")
             if self.data.obs == "image" and method.needs_vector:
                 raise ValueError(
                     f"{method.name} reads observations that are one vector: leave it out with --obs image"

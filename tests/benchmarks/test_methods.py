@@ -3,11 +3,11 @@ import pickle
 import torch
 
 from lab.bridge import BridgeCoupling
+from lab.couplings import OTCoupling, ReflowCoupling
 from lab.methods import METHODS, Method
 from tests.errors import raises
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
-from warmprior.objectives import OTCoupling, ReflowCoupling
 from warmprior.training import TrainingConfig
 
 H = 3
@@ -67,8 +67,6 @@ def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
     assert (source.sample() == 0).all() and not source.warm.any()
     assert method.recipe(TrainingConfig()).times == "start" and not method.is_flow
     assert method.nfes((9, 3)) == [1] and Method("past", H).nfes((1, 9, 1)) == [9, 1]
-    with raises(ValueError, "self_distillation", "'start'"):
-        method.recipe(TrainingConfig(self_distillation=1.0))
 
 
 def test_history_is_withheld_from_those_alone_that_remember():

@@ -147,9 +147,9 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
 def test_tables_name_what_is_not_the_papers():
     plain = read("--preset", "paper")
     assert unlike(plain, PRESETS["paper"]) == []
-    words = "--times u-shaped --objective l1 --self-distillation 0.5 --grid dense-jump"
+    words = "--times u-shaped --objective l1 --grid dense-jump"
     (line,) = unlike(read("--preset", "paper", *words.split()), PRESETS["paper"])
-    changed = "times u-shaped (uniform); objective l1 (velocity); self distillation 0.5 (0.0)"
+    changed = "times u-shaped (uniform); objective l1 (velocity)"
     assert line.endswith(f": {changed}; grid dense-jump (uniform).")
     for words, named, left_out in (
         (

@@ -182,25 +182,6 @@ def test_gradients_are_its_own_affair():
         assert free.guided(velocity, y, left, delay)(at(0.3, a), a).isfinite().all()
 
 
-def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
-    velocity = network()
-    a, y, left, delay = batch()
-    t = at(0.1, a)
-    v = velocity(t, a).detach().flatten(1)
-    unit = v / v.norm(dim=1, keepdim=True)
-    plain, bounded = (
-        RealTimeChunking(trust_region=bound).guided(velocity, y, left, delay)(t, a).flatten(1) - v
-        for bound in (None, 0.2)
-    )
-    (along, across), (bounded_along, bounded_across) = (
-        ((c * unit).sum(1), (c - (c * unit).sum(1, keepdim=True) * unit).norm(dim=1))
-        for c in (plain, bounded)
-    )
-    torch.testing.assert_close(along, bounded_along)
-    assert (across > 0.2 * v.norm(dim=1)).all()
-    torch.testing.assert_close(bounded_across, 0.2 * v.norm(dim=1))
-
-
 def test_options_and_delays_that_cannot_be():
     wrong = {"schedule": "cosine", "horizon": 0, "max_guidance_weight": 0.0, "sigma": -0.1}
     for name, value in wrong.items():

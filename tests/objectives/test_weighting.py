@@ -12,7 +12,6 @@ from warmprior import (
     LinearInterpolant,
     PastPrior,
     PreconditionedNetwork,
-    SelfDistillationLoss,
     SourceMoments,
     VelocityMLP,
     WarmPriorActor,
@@ -89,9 +88,9 @@ def test_errors_are_divided_coordinate_by_coordinate():
     windows["action_is_pad"][0, 1] = True
     times = torch.rand(6)
 
-    def errors(loss=FlowMatchingLoss, **options):
+    def errors(**options):
         options |= {"times": lambda shape, *_: times, "generator": torch.Generator().manual_seed(0)}
-        return loss(actor, reduction="none", **options)(windows)
+        return FlowMatchingLoss(actor, reduction="none", **options)(windows)
 
     unit = actor.network.remainder(times)
     plain, weighed = errors(weighting="velocity"), errors()  # the default of such a network
@@ -100,9 +99,6 @@ def test_errors_are_divided_coordinate_by_coordinate():
     assert not weighed[key][0, 1].any()
     plain, weighed = (errors(objective="l1", weighting=w) for w in ("velocity", "standardised"))
     torch.testing.assert_close(weighed[key], plain[key] / unit)
-    plain, weighed = (errors(SelfDistillationLoss, weighting=w) for w in ("velocity", "standardised"))
-    key, start = "loss_self_distillation", actor.network.remainder(torch.zeros(1))
-    torch.testing.assert_close(weighed[key], plain[key] / start.square())
 
 
 def test_networks_without_a_unit_are_refused():

@@ -23,13 +23,13 @@ from tests.training.cloning_parts import (
     training,
     weights,
 )
-from warmprior import FlowMatchingLoss, SelfDistillationLoss, VelocityMLP, window_replay_buffer
+from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
 from warmprior.training.optim import make_optimizer
 from warmprior.training.options import PAPER
 
-LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
+LATER = {"times": "u-shaped", "objective": "l1"}
 """Options beside Algorithm 1's; the average is the teacher."""
 
 PUBLIC = {"max_grad_norm": 1.2, "count_padding": True, "warmup_ratio": 0.0}
@@ -51,10 +51,7 @@ def test_the_loop_by_hand(tmp_path, options):
     recipe = dict(options)
     clipped, padding = recipe.pop("max_grad_norm", None), recipe.pop("count_padding", False)
     warmup = round(12 * recipe.pop("warmup_ratio", 0.25))
-    weight = recipe.pop("self_distillation", 0.0)
     loss = FlowMatchingLoss(actor, generator=generator, **recipe)
-    recipe.pop("times", None)
-    distillation = SelfDistillationLoss(actor, generator=generator, teacher=average, **recipe)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
     losses, lengths, padded = [], [], 0
     for step in range(12):
@@ -67,8 +64,6 @@ def test_the_loop_by_hand(tmp_path, options):
         if padding:
             batch["action_is_pad"] = torch.zeros_like(batch["action_is_pad"])
         value = loss(batch)["loss_flow_matching"]
-        if weight:
-            value = value + weight * distillation(batch)["loss_self_distillation"]
         losses.append(value.item())
         optimizer.zero_grad()
         if clipped is None:

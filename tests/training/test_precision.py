@@ -6,7 +6,7 @@ from torch import nn
 
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, finished, mlp, weights
-from warmprior import FlowMatchingLoss, PastPrior, SelfDistillationLoss, window_replay_buffer
+from warmprior import FlowMatchingLoss, PastPrior, window_replay_buffer
 from warmprior.training import load_policy, precondition
 from warmprior.training.checkpoint import load_state
 
@@ -19,14 +19,13 @@ def preconditioned():
 
 
 @pytest.mark.parametrize("make", [actor_for, preconditioned])
-@pytest.mark.parametrize("loss_class", [FlowMatchingLoss, SelfDistillationLoss])
-def test_products_are_bf16_and_the_loss_is_close(make, loss_class):
+def test_products_are_bf16_and_the_loss_is_close(make):
     losses, types = [], []
     for bf16 in (False, True):
         actor = make().eval()  # without dropout, which would draw other masks
         layers = [m for m in actor.network.modules() if isinstance(m, nn.Linear)]
         generator = torch.Generator().manual_seed(0)
-        loss = loss_class(actor, generator=generator)
+        loss = FlowMatchingLoss(actor, generator=generator)
         seen = set()
         for layer in loss.actor_network.network.modules():
             if isinstance(layer, nn.Linear):

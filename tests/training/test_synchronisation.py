@@ -54,9 +54,7 @@ PUBLIC = {"max_grad_norm": 1e-2, "count_padding": True}
 CASES = {
     "paper": lambda: (CONFIG, dataset(), actor_for()),
     "options": lambda: (
-        dataclasses.replace(
-            CONFIG, weighting="standardised", times="u-shaped", self_distillation=1.0, **PUBLIC
-        ),
+        dataclasses.replace(CONFIG, weighting="standardised", times="u-shaped", **PUBLIC),
         dataset(),
         preconditioned(PastPrior(4, correlation=0.5)),
     ),

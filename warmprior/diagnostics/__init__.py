@@ -3,7 +3,7 @@
 from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.curvature import branching_bound, branching_cost, curvature, flow_paths
 from warmprior.diagnostics.flow import SharedObservations, encoded_windows
-from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, memory_gain, source_leak
+from warmprior.diagnostics.leaks import HistoryShift, SourceLeak, source_leak
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
 from warmprior.diagnostics.statistics import success_posterior
 
@@ -19,7 +19,6 @@ __all__ = [
     "encoded_windows",
     "executed_actions",
     "flow_paths",
-    "memory_gain",
     "smoothness",
     "source_leak",
     "success_posterior",

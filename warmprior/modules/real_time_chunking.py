@@ -63,8 +63,6 @@ class RealTimeChunking:
             the published weight.
         data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
             POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
-        trust_region: bound on the correction perpendicular to the velocity, as a share of the velocity's
-            norm; None for no bound. POTR bounds that part too; this form is ours.
 
     Raises:
         ValueError: if the schedule is unknown, or a number is out of range.
@@ -85,13 +83,12 @@ class RealTimeChunking:
     jacobian: bool = True
     sigma: float | None = None
     data_std: float = 1.0
-    trust_region: float | None = None
 
     def __post_init__(self) -> None:
         check_choice("schedule", self.schedule, SCHEDULES)
         check_whole_numbers(**given(horizon=self.horizon))
         check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
-        check_not_negative(**given(sigma=self.sigma, trust_region=self.trust_region))
+        check_not_negative(**given(sigma=self.sigma))
 
     def config(self) -> dict[str, Any]:
         """Return the options as JSON holds them."""
@@ -176,19 +173,6 @@ class RealTimeChunking:
                     error = (weights * (leftover - clean)).detach()
                     (correction,) = torch.autograd.grad(clean, point, error)
             v = v.detach()
-            correction = self.guidance_weight(t[:, None, None], sigma) * correction
-            return v + self._within(correction, v)
+            return v + self.guidance_weight(t[:, None, None], sigma) * correction
 
         return corrected
-
-    def _within(self, correction: Tensor, velocity: Tensor) -> Tensor:
-        """Return the correction, limited to the trust region around the velocity's direction."""
-        if self.trust_region is None:
-            return correction
-        c, v = correction.flatten(1), velocity.flatten(1)
-        tiny = torch.finfo(c.dtype).tiny
-        along = (c * v).sum(1, keepdim=True) / v.square().sum(1, keepdim=True).clamp(min=tiny) * v
-        across = c - along
-        bound = self.trust_region * v.norm(dim=1, keepdim=True)
-        share = (bound / across.norm(dim=1, keepdim=True).clamp(min=tiny)).clamp(max=1.0)
-        return (along + share * across).view_as(correction)

@@ -1,13 +1,8 @@
-"""Losses, and how they pair sources with targets."""
+"""The loss, and how it pairs sources with targets."""
 
-from warmprior.objectives.couplings import Coupling, OTCoupling, ReflowCoupling
-from warmprior.objectives.flow_matching import FlowMatchingLoss
-from warmprior.objectives.self_distillation import SelfDistillationLoss
+from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
 
 __all__ = [
     "Coupling",
     "FlowMatchingLoss",
-    "OTCoupling",
-    "ReflowCoupling",
-    "SelfDistillationLoss",
 ]

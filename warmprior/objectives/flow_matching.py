@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, cast, get_args
 
@@ -17,8 +18,15 @@ from warmprior.checks import check_choice, check_keys, check_positions
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import device_of, network_observation, velocity_field
-from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.times import Times, chosen_times
+
+Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
+"""A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
+
+The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
+may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
+``times``, a path and training times that the loss uses instead of its own.
+"""
 
 Objective = Literal["velocity", "l1"]
 
@@ -72,7 +80,6 @@ class FlowMatchingLoss(LossModule):
         ValueError: if an option is unknown, or does not fit another option, the network or the policy.
 
     See Also:
-        :class:`~warmprior.SelfDistillationLoss`: trains one integration step to end where the flow ends.
         :class:`~warmprior.training.BehaviourCloning`: the training loop around this loss.
 
     Examples:
@@ -144,8 +151,12 @@ class FlowMatchingLoss(LossModule):
                 f"the network is preconditioned for the path {built_for.config()}, but the loss has "
                 f"{self.interpolant.config()}: give both the same interpolant"
             )
-        if times == "start" or objective == "l1":
-            check_straight(self.interpolant)
+        straight = isinstance(self.interpolant, LinearInterpolant)
+        if not straight and (times == "start" or objective == "l1"):
+            raise ValueError(
+                "a velocity predicts the sample only on a straight path: use LinearInterpolant, not "
+                f"{type(self.interpolant).__name__}"
+            )
         self.generator = actor_network.sampler.generator if generator is None else generator
         self.set_keys(observation=actor_network.observation_key)
 
@@ -157,21 +168,6 @@ class FlowMatchingLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss of a batch of windows; raise KeyError if a needed key is missing."""
-        a0, a1, observation, weight = self.ends(tensordict)
-        t = self.times(a1.shape[:-2], self.generator, a1.dtype, a1.device)
-        a_t, velocity = self.interpolant(a0, a1, t, self.generator)
-        field = velocity_field(self.actor_network.network, observation)
-        predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
-        loss = self.reduced(self.error(predicted, velocity, t), weight)
-        return TensorDict({self.out_keys[0]: loss}, batch_size=[])
-
-    def ends(
-        self, tensordict: TensorDictBase
-    ) -> tuple[Tensor, Tensor, Tensor | TensorDictBase, Tensor | None]:
-        """Return both ends of the paths, ``[*B, P, d_a]``, flat observations, and the positions' weights.
-
-        Weights are ``[*B, P]``, or ``None`` if all are equal.
-        """
         k, actor = self.tensor_keys, self.actor_network
         needed = (k.chunk, k.history, k.observation)
         check_keys(tensordict, needed, type(self).__name__, ". Take batches of window_replay_buffer")
@@ -181,10 +177,15 @@ class FlowMatchingLoss(LossModule):
         a0 = actor.prior.sample(history, observation, self.generator)
         if self.coupling is not None:
             a0, a1 = self.coupling(a0, a1, observation)
-        observation = network_observation(observation, a1.shape[:-2])
-        return a0, a1, observation, self._weight(tensordict, a1)
+        t = self.times(a1.shape[:-2], self.generator, a1.dtype, a1.device)
+        a_t, velocity = self.interpolant(a0, a1, t, self.generator)
+        field = velocity_field(actor.network, network_observation(observation, a1.shape[:-2]))
+        predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
+        loss = self._reduced(self._error(predicted, velocity, t), self._weight(tensordict, a1))
+        return TensorDict({self.out_keys[0]: loss}, batch_size=[])
 
     def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> Tensor | None:
+        """Return the positions' weights ``[*B, P]``, or ``None`` if all are equal."""
         pad, weight = tensordict.get(self.tensor_keys.pad_mask, None), None
         factors = [None if pad is None else ~pad, self._maybe_get_priority_weight(tensordict)]
         factors += [tensordict.get(key, None) for key in self._loss_mask_keys()]
@@ -195,7 +196,7 @@ class FlowMatchingLoss(LossModule):
                 weight = factor if weight is None else weight * factor
         return None if weight is None else weight.expand(a1.shape[:-1])
 
-    def error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
+    def _error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
         """Return the objective's error ``[*B, P, d_a]`` of velocities predicted at times ``t`` ``[*B]``."""
         error = predicted - velocity
         if self.weighting == "standardised":
@@ -203,7 +204,7 @@ class FlowMatchingLoss(LossModule):
             error = error / unit.view_as(error)
         return (1 - t)[..., None, None] * error.abs() if self.objective == "l1" else error.square()
 
-    def reduced(self, error: Tensor, weight: Tensor | None) -> Tensor:
+    def _reduced(self, error: Tensor, weight: Tensor | None) -> Tensor:
         """Reduce errors ``[*B, P, d_a]`` with weights ``[*B, P]``."""
         count: Tensor | int = max(1, error.numel())
         if weight is not None:
@@ -214,12 +215,3 @@ class FlowMatchingLoss(LossModule):
         if self.reduction == "none":
             return error
         return error.sum() / count if self.reduction == "mean" else error.sum()
-
-
-def check_straight(interpolant: Interpolant) -> None:
-    """Raise ValueError unless a velocity predicts the sample, as on a straight path."""
-    if not isinstance(interpolant, LinearInterpolant):
-        raise ValueError(
-            "a velocity predicts the sample only on a straight path: use LinearInterpolant, not "
-            f"{type(interpolant).__name__}"
-        )

@@ -19,7 +19,7 @@ from warmprior.io.files import exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
-from warmprior.objectives.couplings import Coupling
+from warmprior.objectives.flow_matching import Coupling
 from warmprior.training.checkpoint import (
     check_identity,
     data_digest,

@@ -15,9 +15,7 @@ from warmprior import keys
 from warmprior.io.distributed import world_size
 from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.objectives.couplings import Coupling
-from warmprior.objectives.flow_matching import FlowMatchingLoss
-from warmprior.objectives.self_distillation import SelfDistillationLoss
+from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
 from warmprior.training.checkpoint import (
     module_tensors,
     named,
@@ -31,13 +29,13 @@ from warmprior.training.options import TrainingConfig
 
 
 class GradientStep:
-    """The losses of a policy, its optimiser, learning-rate schedule and averaged weights (Table 3).
+    """The loss of a policy, its optimiser, learning-rate schedule and averaged weights (Table 3).
 
     Args:
         actor: the policy; its network, and its prior if it has weights, are trained in place.
         config: the recipe.
         coupling: pairs sources and targets.
-        generator: draws the losses' randomness, on the network's device.
+        generator: draws the loss's randomness, on the network's device.
     """
 
     def __init__(
@@ -54,18 +52,19 @@ class GradientStep:
             self.trained["prior"] = actor.prior
         self.ema = ema_of(self.trained, config.ema_rate)
         self._average = cast(Any, self.ema).update_from(self.trained)
-        shared: dict[str, Any] = {"objective": config.objective, "weighting": config.weighting}
-        shared |= {"coupling": coupling, "generator": generator}
-        self.loss_module = FlowMatchingLoss(actor, times=config.times, **shared)
-        losses = {self.loss_module: 1.0}
-        if config.self_distillation:
-            teacher = cast(Any, self.ema.module)["network"]
-            losses[SelfDistillationLoss(actor, teacher=teacher, **shared)] = config.self_distillation
-        self._loss: nn.Module = _WeightedSum(losses)
+        self.loss_module = FlowMatchingLoss(
+            actor,
+            times=config.times,
+            objective=config.objective,
+            weighting=config.weighting,
+            coupling=coupling,
+            generator=generator,
+        )
+        self._loss: nn.Module = _Scalar(self.loss_module)
         if world_size() > 1:
             self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
         self._device = generator.device if generator is not None else torch.device("cpu")
-        # Without the cache, which could return weights that the teacher has cast without gradients.
+        # Without the cache, which could return weights that were cast without gradients.
         self._precision = partial(
             torch.autocast,
             self._device.type,
@@ -149,13 +148,12 @@ class GradientStep:
             group["lr"] = base * factor(iteration)
 
 
-class _WeightedSum(nn.Module):
-    """The weighted sum of a batch's losses, whose gradients DDP averages."""
+class _Scalar(nn.Module):
+    """The loss of a batch as a tensor, whose gradients DDP averages."""
 
-    def __init__(self, losses: dict[FlowMatchingLoss, float]) -> None:
+    def __init__(self, loss_module: FlowMatchingLoss) -> None:
         super().__init__()
-        self.losses, self.weights = nn.ModuleList(losses), list(losses.values())
+        self.loss_module = loss_module
 
     def forward(self, batch: TensorDictBase) -> Tensor:
-        values = [loss(batch)[str(cast(FlowMatchingLoss, loss).out_keys[0])] for loss in self.losses]
-        return torch.stack([w * v for w, v in zip(self.weights, values, strict=True)]).sum()
+        return cast(Tensor, self.loss_module(batch)["loss_flow_matching"])

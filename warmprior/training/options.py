@@ -165,8 +165,6 @@ class TrainingConfig:
         weighting: weighting of the loss: errors unchanged (velocity), or divided by the standard deviation
             that preconditioning leaves, so that all times have equal weight (standardised). The latter is the
             default for a preconditioned network.
-        self_distillation: weight of the loss that trains one integration step to end where the averaged
-            weights' flow does.
         count_padding: let actions past an episode's end, where its last one is repeated, count in the loss.
         precision: precision of the network's matrix products in training; weights, averages and optimiser are
             float32.
@@ -193,7 +191,6 @@ class TrainingConfig:
     times: TimesName = "uniform"
     objective: Objective = "velocity"
     weighting: Weighting | None = None
-    self_distillation: float = 0.0
     count_padding: bool = False
     precision: Precision = "float32"
     cold_probability: float = 0.0
@@ -205,14 +202,12 @@ class TrainingConfig:
         if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # other seeds are offsets from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
         check_positive(learning_rate=self.learning_rate, **given(max_grad_norm=self.max_grad_norm))
-        check_not_negative(weight_decay=self.weight_decay, self_distillation=self.self_distillation)
+        check_not_negative(weight_decay=self.weight_decay)
         check_share(warmup_ratio=self.warmup_ratio, ema_rate=self.ema_rate)
         check_between(0, 1, cold_probability=self.cold_probability)
         for name, choices in CHOICES.items():
             if getattr(self, name) is not None:
                 check_choice(name, getattr(self, name), choices)
-        if self.self_distillation and self.times == "start":
-            raise ValueError("self_distillation needs a flow, but times = 'start' trains none")
 
     @property
     def checkpoint_iterations(self) -> list[int]:

@@ -23,7 +23,7 @@ from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import PoseTrend, RestingAction
-from warmprior.objectives.couplings import Coupling
+from warmprior.objectives.flow_matching import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed

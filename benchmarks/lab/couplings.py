@@ -1,8 +1,7 @@
-"""Couplings: how the sources and targets of a batch are paired."""
+"""OT-CFM and 2-rectified flow: how the sources and targets of a batch are paired."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -14,14 +13,6 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
-
-Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
-"""A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
-
-The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
-may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
-``times``, a path and training times that the loss uses instead of its own.
-"""
 
 
 class OTCoupling:
@@ -46,7 +37,7 @@ class OTCoupling:
 
     Examples:
         >>> import torch
-        >>> from warmprior.objectives import OTCoupling
+        >>> from lab.couplings import OTCoupling
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
         >>> [x.flatten().tolist() for x in OTCoupling(observation_weight=0.0)(a0, a1)]
         [[1.0, 0.0], [5.0, 4.0]]
@@ -113,7 +104,7 @@ class ReflowCoupling:
     Examples:
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.objectives import ReflowCoupling
+        >>> from lab.couplings import ReflowCoupling
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
         >>> a0, a1, observation = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
         >>> source, target = couple(a0, a1, observation)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lab.learned_sources import ForecastPrior, ForecastStart
+from lab.memory_gain import memory_gain
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from tests.errors import raises
 from warmprior import (
@@ -16,7 +17,7 @@ from warmprior import (
     RealTimeChunking,
     WarmPriorActor,
 )
-from warmprior.diagnostics import flow, memory_gain
+from warmprior.diagnostics import flow
 
 N = 20_000
 
