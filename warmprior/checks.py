@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
@@ -35,36 +35,31 @@ def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
-def check_positive(**values: Any) -> None:
-    """Raise ValueError for the first value that is not a finite number > 0."""
+def _check_range(values: Mapping[str, Any], holds: Callable[[float], bool], words: str) -> None:
     check_finite_numbers(**values)
     for name, value in values.items():
-        if value <= 0:
-            raise ValueError(f"{name} must be > 0, got {value}")
+        if not holds(value):
+            raise ValueError(f"{name} must be {words}, got {value}")
+
+
+def check_positive(**values: Any) -> None:
+    """Raise ValueError for the first value that is not a finite number > 0."""
+    _check_range(values, lambda value: value > 0, "> 0")
 
 
 def check_not_negative(**values: Any) -> None:
     """Raise ValueError for the first value that is not a finite number >= 0."""
-    check_finite_numbers(**values)
-    for name, value in values.items():
-        if value < 0:
-            raise ValueError(f"{name} must be >= 0, got {value}")
+    _check_range(values, lambda value: value >= 0, ">= 0")
 
 
 def check_share(**values: Any) -> None:
     """Raise ValueError for the first value that is not a number in [0, 1)."""
-    check_finite_numbers(**values)
-    for name, value in values.items():
-        if not 0 <= value < 1:
-            raise ValueError(f"{name} must be in [0, 1), got {value}")
+    _check_range(values, lambda value: 0 <= value < 1, "in [0, 1)")
 
 
 def check_between(low: float, high: float, /, **values: Any) -> None:
     """Raise ValueError for the first value that is not a number in the interval, ends included."""
-    check_finite_numbers(**values)
-    for name, value in values.items():
-        if not low <= value <= high:
-            raise ValueError(f"{name} must be between {low} and {high}, got {value}")
+    _check_range(values, lambda value: low <= value <= high, f"between {low} and {high}")
 
 
 def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:

@@ -21,6 +21,7 @@ from lab.tasks import (
     check_network,
     check_place,
     is_simulated,
+    without_images,
 )
 from warmprior.data.opening import name_of_place
 from warmprior.io.distributed import check_batch, launched
@@ -160,7 +161,7 @@ class Options:
         check_batch(self.training.batch_size)
         try:
             with torch.device("meta"):  # nothing is computed
-                self.network.without_images().make(1, 1, 2)
+                without_images(self.network).make(1, 1, 2)
         except ValueError as error:
             raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):

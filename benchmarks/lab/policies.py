@@ -31,7 +31,7 @@ from lab.options import Evaluation, Options, Run, with_parts
 from lab.rows import read_rows
 from lab.source_errors import mean_revision
 from lab.stored_options import of_run, stored_options
-from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of
+from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of, without_images
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
 from warmprior.io.distributed import from_leader, rank
@@ -141,7 +141,7 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
             )
     policies = []
     for place, task in tasks.items():
-        network = options.network if task.images else options.network.without_images()
+        network = options.network if task.images else without_images(options.network)
         for training in options.trainings():
             for method in options.sources.methods():
                 if method.chunk_length > longest_of(task):

@@ -211,10 +211,17 @@ class DataOptions:
         return self.first(style) or GENERATED
 
 
+def without_images(network: NetworkOptions) -> NetworkOptions:
+    """Return options with defaults for those that have no effect without images."""
+    usual = NetworkOptions()
+    names = ("encoder", "crop_size", "share_encoder")
+    return replace(network, **{name: getattr(usual, name) for name in names})
+
+
 def check_network(network: NetworkOptions, data: DataOptions) -> None:
     """Raise an error for options of images that do not fit, and for pretrained weights that are missing."""
     if data.obs == "state":
-        usual = network.without_images() == network or network.encoder == "resnet18"
+        usual = without_images(network) == network or network.encoder == "resnet18"
         if not usual or data.image_size != DataOptions().image_size:
             raise ValueError("--image-size, --crop-size, --share-encoder and --encoder belong to --obs image")
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from warmprior.checks import (
@@ -92,12 +92,6 @@ class NetworkOptions:
 
     def _of_transformers(self) -> dict[str, Any]:
         return given(observation_layers=self.observation_layers, time_frequency=self.time_frequency)
-
-    def without_images(self) -> NetworkOptions:
-        """Return a copy with defaults for the options that have no effect without images."""
-        usual = NetworkOptions()
-        names = ("encoder", "crop_size", "share_encoder")
-        return replace(self, **{name: getattr(usual, name) for name in names})
 
     def make(
         self,
