@@ -1,4 +1,4 @@
-"""Draw and write the leaderboard: success of methods on human demonstrations, by NFE.
+"""Draw and write the leaderboard: success of methods on human and on scripted demonstrations, by NFE.
 
 The README's table has its means next to those on scripted demonstrations.
 
@@ -10,12 +10,13 @@ and its interval is from the same bootstrap.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from pages import own_best, write
 from pandas import DataFrame, concat
-from results import GROUPS, WARM
+from results import GROUPS, TWENTY_FIVE, WARM
 from scipy.stats import rankdata
 from shared import (
     DOCS,
@@ -38,54 +39,72 @@ from lab.statistics import resampled_means
 
 PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
 DOOR = "door, 25"
-FAMILIES = {  # human demonstrations and their number, and the rows of their runs
-    DOOR: "door_20000",
-    "Push-T, 25": "pusht_25",
-    "Push-T, 50": "pusht_50",
-    "Push-T, 206": "pusht_206_45000",
+Sets = Mapping[str, tuple[str | None, Sequence[str]]]
+"""By name of the demonstrations: the task, or None if its runs have one task, and the runs of their rows."""
+
+HUMAN: Sets = {
+    DOOR: (None, ("door_20000",)),
+    "Push-T, 25": (None, ("pusht_25",)),
+    "Push-T, 50": (None, ("pusht_50",)),
+    "Push-T, 206": (None, ("pusht_206_45000",)),
+}
+SCRIPTED: Sets = {f"{task}, 25": (task, GROUPS[TWENTY_FIVE]) for task in ("square", "can", "stack")}
+TITLES = {
+    "Human demonstrations: the mean of four sets": HUMAN,
+    "25 scripted demonstrations: the mean of three tasks": SCRIPTED,
 }
 
 
-def trials(own_noise: bool = True) -> DataFrame:
-    """Return the rows of all families, by default at the noise of each source's training (MIP's is 0)."""
-    rows = concat([read_played(run).assign(family=family) for family, run in FAMILIES.items()])
+def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
+    """Return the rows of all sets, by default at the noise of each source's training (MIP's is 0)."""
+    parts = []
+    for name, (task, runs) in sets.items():
+        rows = concat(map(read_played, runs)).assign(set=name)
+        parts.append(rows if task is None else rows[rows["task"] == task])
+    rows = concat(parts)
     return with_own_noise(rows) if own_noise else rows
 
 
-def pairs() -> DataFrame:
-    """Return episodes won and lost against the Gaussian source at the same NFE, over all families."""
-    rows = trials()
-    warm, base = rows[rows["source"] != GAUSSIAN], rows[rows["source"] == GAUSSIAN]
-    both = warm.merge(base, on=["family", "seed", "nfe"], suffixes=("", "_base"))
+def pairs(sets: Sets = HUMAN, baseline: str = GAUSSIAN) -> DataFrame:
+    """Return episodes won and lost against a source, over all sets.
+
+    That source has the same NFE, or, if it was not played with that, its largest.
+    """
+    rows = trials(sets)
+    others, base = rows[rows["source"] != baseline], rows[rows["source"] == baseline]
+    base_nfe = others["nfe"].where(others["nfe"].isin(base["nfe"]), base["nfe"].max())
+    keys = ["set", "seed"]
+    both = others.assign(base_nfe=base_nfe).merge(
+        base, left_on=[*keys, "base_nfe"], right_on=[*keys, "nfe"], suffixes=("", "_base")
+    )
     for ahead, name in (1, "won"), (-1, "lost"):
         differences = both["solved"] - both["solved_base"]
         both[name] = [(ahead * difference > 0).sum() for difference in differences]
     return both.groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
 
 
-def with_best_noise() -> dict[tuple[str, int], float]:
+def with_best_noise(sets: Sets = HUMAN) -> dict[tuple[str, int], float]:
     """Return the mean success per method and NFE, each with its best noise, chosen on other episodes."""
     rates: dict[tuple[str, int], list[float]] = {}
-    for (_, nfe), part in trials(own_noise=False).groupby(["family", "nfe"]):
+    for (_, nfe), part in trials(sets, own_noise=False).groupby(["set", "nfe"]):
         for source, outcomes in own_best(part).items():
             rates.setdefault((source, nfe), []).append(100 * outcomes.mean())
-    return {setting: float(np.mean(of)) for setting, of in rates.items() if len(of) == len(FAMILIES)}
+    return {setting: float(np.mean(of)) for setting, of in rates.items() if len(of) == len(sets)}
 
 
-def standings() -> DataFrame:
-    """Return success per method and NFE in percent, by family and on average, with ranks and intervals."""
-    rng, lines, draws, best = np.random.default_rng(0), [], [], with_best_noise()
-    for (source, nfe), part in trials().groupby(["source", "nfe"]):
-        families = {name: group for name, group in part.groupby("family")}
-        if set(families) != set(FAMILIES):
+def standings(sets: Sets = HUMAN) -> DataFrame:
+    """Return success per method and NFE in percent, by set and on average, with ranks and intervals."""
+    rng, lines, draws, best = np.random.default_rng(0), [], [], with_best_noise(sets)
+    for (source, nfe), part in trials(sets).groupby(["source", "nfe"]):
+        by_set = {name: group for name, group in part.groupby("set")}
+        if set(by_set) != set(sets):
             continue
         draws.append(
-            100 * resampled_means([(g["successes"], g["episodes"].iloc[0]) for g in families.values()], rng)
+            100 * resampled_means([(g["successes"], g["episodes"].iloc[0]) for g in by_set.values()], rng)
         )
-        rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in families.items()}
+        rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in by_set.items()}
         mean, at_best = np.mean(list(rates.values())), best.get((source, nfe), np.nan)
         lines.append({"source": source, "nfe": nfe, "mean": mean, "best noise": at_best, **rates})
-        lines[-1]["runs"] = len(part)
     frame, draws = DataFrame(lines), np.stack(draws)
     ends = {"mean": draws, "rank": rankdata(-draws, axis=0)}
     frame["rank"] = rankdata(-frame["mean"], "min")
@@ -95,36 +114,37 @@ def standings() -> DataFrame:
 
 
 def draw() -> None:
-    """Draw the mean over families against the number of network evaluations."""
-    frame = standings()
-    picture, (axis,) = figure(WIDTH, 4.6, 1, "Human demonstrations: the mean of four sets")
-    for k, source in enumerate(shown := shown_sources(frame)):
-        label, color, mark = SOURCES[source]
-        part = frame[frame["source"] == source].sort_values("nfe")
-        bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
-        places = part["nfe"] * beside(k, len(shown))
-        axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
-    finish(axis, "", xlabel="network evaluations per chunk (NFE)", ylabel="solved in percent, 95% interval")
-    axis.set(xscale="log", ylim=(0, None))
-    axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])
-    axis.minorticks_off()
+    """Draw the mean over sets against the number of network evaluations."""
+    picture, axes = figure(WIDTH, 8.6, 1, "Success of methods", rows=len(TITLES))
+    for axis, (title, sets) in zip(axes, TITLES.items(), strict=True):
+        frame = standings(sets)
+        for k, source in enumerate(shown := shown_sources(frame)):
+            label, color, mark = SOURCES[source]
+            part = frame[frame["source"] == source].sort_values("nfe")
+            bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
+            places = part["nfe"] * beside(k, len(shown))
+            axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
+        finish(axis, title, xlabel="network evaluations per chunk (NFE)")
+        axis.set(xscale="log", ylim=(0, None))
+        axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])
+        axis.minorticks_off()
+    picture.supylabel("solved in percent, 95% interval", fontsize=10)
     save(picture, "leaderboard")
 
 
-def table() -> str:
+def table(sets: Sets) -> str:
     """Return the standings in Markdown."""
-    names, won_and_lost = ("mean", "best noise", *FAMILIES), pairs()
-    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost | runs |"]
-    text.append("|---" * (5 + len(names)) + "|")
-    for _, row in standings().iterrows():
+    names, won_and_lost = ("mean", "best noise", *sets), pairs(sets)
+    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost |"]
+    text.append("|---" * (4 + len(names)) + "|")
+    for _, row in standings(sets).iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
         setting = row["source"], row["nfe"]
         pair = won_and_lost.loc[setting] if setting in won_and_lost.index else None
         rates = ["" if np.isnan(row[name]) else f"{row[name] + 1e-6:.0f}" for name in names]
         cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
-        text.append(
-            f"| {' | '.join(cells)} | {'' if pair is None else f'{pair.won} : {pair.lost}'} | {row['runs']} |"
-        )
+        cells.append("" if pair is None else f"{pair.won} : {pair.lost}")
+        text.append(f"| {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
 
@@ -142,7 +162,7 @@ def readme_table() -> str:
 
 def tables() -> dict[Path, list[str]]:
     """Return the table of each page."""
-    return {PAGE: [table()], README: [readme_table()]}
+    return {PAGE: [table(sets) for sets in TITLES.values()], README: [readme_table()]}
 
 
 if __name__ == "__main__":

@@ -28,6 +28,8 @@ SOURCES = {  # label, colour and marker in charts
     PAST: ("WP-Past", "#1f77b4", "o"),
     PREVIEW: ("WP-Preview", "#d95f02", "o"),
     CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
+    f"{GAUSSIAN},l1": ("Gaussian source, L1 loss", "#7f7f7f", "v"),
+    f"{CORRELATED},l1": ("WP-Past, correlated noise, L1 loss", "#1b9e77", "v"),
     "mip": ("MIP", "#a6761d", "s"),
     "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
     "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
@@ -36,11 +38,15 @@ WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 
 
 def read_played(name: str) -> DataFrame:
-    """Return the rows of a run, with source, factor of its noise, and the outcome of every episode."""
+    """Return the rows of a run, with source, factor of its noise, and the outcome of every episode.
+
+    The source of runs with an L1 loss, whose names end in ``_l1``, says so.
+    """
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     options = rows["options"].where(rows["options"] == "", "," + rows["options"])
     noise = rows.get("temperature", Series(1.0, rows.index)).fillna(1.0)  # 1 if unnamed
-    rows = rows.assign(source=rows["prior"] + options, noise=noise)
+    loss = ",l1" if name.endswith("_l1") else ""
+    rows = rows.assign(source=rows["prior"] + options + loss, noise=noise)
     return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
 
 
