@@ -72,7 +72,11 @@ def test_objects_are_where_they_are_whatever_else_is_observed(loop):
     [
         ("Panda", {"type": "OSC_POSE"}, [2.0] * 3 + [np.pi] * 3),
         ("Panda", {"type": "OSC_POSITION"}, [2.0] * 3),
-        ("Panda", {"type": "OSC_POSE", "impedance_mode": "variable_kp"}, [1.0] * 6 + [2.0] * 3 + [np.pi] * 3),
+        (
+            "Panda",
+            {"type": "OSC_POSE", "impedance_mode": "variable_kp"},
+            [300.0] * 6 + [2.0] * 3 + [np.pi] * 3,
+        ),
         # Every other joint of this arm turns without end.
         ("Kinova3", {"type": "JOINT_POSITION"}, [np.pi, 2.41, np.pi, 2.66, np.pi, 2.23, np.pi]),
     ],
@@ -83,8 +87,21 @@ def test_absolute_targets_have_the_width_of_the_simulator(robot, controller, exp
     parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
     parts["right"] = parts["right"] | controller | {"input_type": "absolute"}
     env = make_simulator(env_args)
-    assert action_limits(env) == pytest.approx([*expected, *[1.0] * (env.action_dim - len(expected))])
+    low, high = action_limits(env)
+    assert high == pytest.approx([*expected, *[1.0] * (env.action_dim - len(expected))])
+    assert low == pytest.approx(np.where(high == 300, 0, -high))  # stiffness is positive
     env.close()
+
+
+def test_deltas_have_the_range_of_the_controller():
+    env_args = task_env_args("lift")
+    parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
+    parts["right"] |= {"input_max": 2, "input_min": -0.5, "impedance_mode": "variable", "kp_limits": [10, 40]}
+    with closing(RobosuiteEnv(env_args=env_args)) as env:
+        space = env.action_spec.space
+        assert space.low.tolist() == [0.0] * 6 + [10.0] * 6 + [-0.5] * 6 + [-1.0]
+        assert space.high.tolist() == [10.0] * 6 + [40.0] * 6 + [2.0] * 6 + [1.0]
+        check_env_specs(env)
 
 
 def test_absolute_joint_targets():

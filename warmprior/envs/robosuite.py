@@ -40,7 +40,7 @@ class RobosuiteEnv(EnvBase):
     ``"sim_state"``     ``[1 + nq + nv]`` float64, time, positions and velocities; only ``sim_state``
     ``"eef_pose"``      ``[arms, 3, 4]`` float32; only ``eef_pose``
     ``"success"``       ``[1]`` bool
-    ``"action"``        ``[d_a]`` float32 in ``[-1, 1]``, the simulator's own units
+    ``"action"``        ``[d_a]`` float32 in the controller's range, ``[-1, 1]`` for the tasks
     ``"reward"``        ``[1]`` float32: 1 where the task is solved, 0 elsewhere
     ``"terminated"``    ``[1]`` bool: solved (see ``terminate_on_success``)
     ``"truncated"``     ``[1]`` bool: out of time
@@ -222,8 +222,8 @@ class RobosuiteEnv(EnvBase):
         if self.eef_pose:
             shape = (len(env.robots), 3, 4)
             self.observation_spec[keys.EEF_POSE] = Unbounded(shape, device=self.device)
-        limit = torch.tensor(action_limits(env))
-        self.action_spec = Bounded(-limit, limit, device=self.device)
+        low, high = (torch.from_numpy(ends).float() for ends in action_limits(env))
+        self.action_spec = Bounded(low, high, device=self.device)
         self.reward_spec = Bounded(0.0, 1.0, shape=(1,), device=self.device)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag())
 

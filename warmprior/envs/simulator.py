@@ -143,26 +143,27 @@ def check_scene_stays(env: Any) -> None:
         raise ValueError(f"{type(env).__name__} moves fixtures at resets")
 
 
-def action_limits(env: Any) -> list[float]:
-    """Return the largest magnitude of each entry of an environment's action.
+def action_limits(env: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each entry of an environment's action, each ``[d_a]``.
 
-    For absolute targets it only bounds random samples: joints by their range in radians, poses by two metres
+    For absolute targets they only bound random samples: joints by their range in radians, poses by two metres
     and half a turn.
     """
-    limits: list[float] = []
+    limits = []
     for robot in env.robots:
         composite = robot.composite_controller
-        magnitudes = np.ones(robot.action_dim)
+        low, high = (np.array(ends, np.float64) for ends in composite.action_limits)
         for part, (first, last) in composite._action_split_indexes.items():
             controller = composite.part_controllers.get(part)
             if getattr(controller, "input_type", "delta") == "absolute":
-                target = [2.0] * 3 + [np.pi] * 3
+                target = np.array([2.0] * 3 + [np.pi] * 3)
                 if controller.name == "JOINT_POSITION":
                     ranges = env.sim.model.jnt_range[controller.joint_index]
                     limited = env.sim.model.jnt_limited[controller.joint_index]
-                    target = np.where(limited, np.abs(ranges).max(-1), np.pi).tolist()
+                    target = np.where(limited, np.abs(ranges).max(-1), np.pi)
                 # Positions stand first, or gains before them.
                 target = target[: last - first]
-                magnitudes[last - len(target) : last] = target
-        limits += magnitudes.tolist()
-    return limits
+                low[last - len(target) : last], high[last - len(target) : last] = -target, target
+        limits.append((low, high))
+    low, high = map(np.concatenate, zip(*limits, strict=True))
+    return low, high
