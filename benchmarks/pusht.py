@@ -23,7 +23,7 @@ from lab.command_line import script
 from lab.options import with_parts
 from lab.presets import PRESETS
 from lab.tasks import DataOptions
-from warmprior.data import lerobot_steps
+from warmprior.data import LeRobotDemonstrations
 from warmprior.envs import gym_env
 from warmprior.io.extras import require
 from warmprior.training import Task
@@ -49,7 +49,8 @@ def make_env(relative: bool = False) -> EnvBase:
 def task(options: DataOptions, relative: bool = False) -> Task:
     """Return the task: human demonstrations, and the environment that policies are played in."""
     place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
-    steps = lerobot_steps(place, OBSERVATION, demos=options.first("human"))
+    chosen: Any = {"observation_keys": OBSERVATION, "demos": options.first("human")}
+    steps = LeRobotDemonstrations(place, **chosen).data.copy()
     if relative:
         steps["action"] = steps["action"] - steps["observation"][:, :2]
     ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "video_rate": 10}

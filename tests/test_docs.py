@@ -16,7 +16,6 @@ PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.
 SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
     "warmprior.data.MinariDemonstrations": "needs a dataset",
-    "warmprior.data.lerobot_steps": "needs a dataset",
     "warmprior.data.observe_recordings": "needs a recording",
     "warmprior.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",

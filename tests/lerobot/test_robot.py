@@ -150,7 +150,7 @@ def test_lerobots_own_loop_runs_a_policy_on_a_robot_of_a_package(tmp_path):
     assert np.abs(sent).max() <= 0.51  # targets of the demonstrations
     kept = ["--dataset.repo_id=local/rollout_arm", f"--dataset.root={tmp_path / 'rollout'}"]
     run("lerobot-rollout", *rollout, "--strategy.type=episodic", *kept, *recorded)
-    from warmprior.data import lerobot_steps
+    from warmprior.data import LeRobotDemonstrations
 
-    steps = lerobot_steps(tmp_path / "rollout", ["observation.state"])
+    steps = LeRobotDemonstrations(tmp_path / "rollout", observation_keys=["observation.state"]).data
     assert len(steps["episode"].unique()) == 2 and steps["action"].abs().max() <= 0.51

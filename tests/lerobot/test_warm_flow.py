@@ -14,7 +14,7 @@ from warmprior import (
     VelocityMLP,
     keys,
 )
-from warmprior.data import lerobot_steps
+from warmprior.data import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
 
@@ -44,7 +44,7 @@ def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
         feature.shape = tuple(widths[name])
     config.output_features["action"].shape = tuple(widths["action"])
     policy = found["warm_flow"](config, dataset_meta=meta)
-    steps = lerobot_steps(tmp_path / "data", config.observed)
+    steps = LeRobotDemonstrations(tmp_path / "data", observation_keys=config.observed).data
     low, high = steps["action"].amin(0), steps["action"].amax(0)
     normalised = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1
     assert (normalised[:, -1] == -1).all()  # as LeRobot has what never changes
@@ -73,7 +73,7 @@ def dataset_policy(found, root, episodes=None, place=None, **options):
 
 def moments_by_hand(policy, dataset, episodes):
     """Return some episodes, normalised by the statistics of all, as LeRobot's processors do."""
-    steps = lerobot_steps(dataset.root, policy.config.observed)
+    steps = LeRobotDemonstrations(dataset.root, observation_keys=policy.config.observed).data
     steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
     low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
     steps["action"] = 2 * (steps["action"] - low) / (high - low) - 1

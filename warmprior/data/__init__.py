@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.lerobot import LeRobotDemonstrations, lerobot_steps
+from warmprior.data.lerobot import LeRobotDemonstrations
 from warmprior.data.minari import MinariDemonstrations
 from warmprior.data.observe import observe_recordings
 from warmprior.data.replay import DatasetError
@@ -15,6 +15,5 @@ __all__ = [
     "MinariDemonstrations",
     "RobomimicDemonstrations",
     "convert_robomimic",
-    "lerobot_steps",
     "observe_recordings",
 ]

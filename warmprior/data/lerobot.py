@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior.checks import check_shape
@@ -23,7 +22,6 @@ from warmprior.data.replay import (
     store_finite,
 )
 from warmprior.io.extras import require
-from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
@@ -196,39 +194,3 @@ class LeRobotDemonstrations(DemonstrationReplay):
     def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
         index = read_lerobot_index(place, fetch=True, **self._own, **chosen)
         yield index, LeRobotReader(index)
-
-
-def lerobot_steps(
-    dataset: str | Path,
-    observation_keys: Sequence[str] = ("observation.state",),
-    *,
-    demos: int | None = None,
-    episodes: Sequence[int] | None = None,
-) -> TensorDictBase:
-    """Read the steps of a LeRobotDataset of any robot, in raw units.
-
-    Args:
-        dataset: the dataset's folder, or its repository on the hub (``"user/name"``).
-        observation_keys: features of the observation, concatenated in this order.
-        demos: number of demonstrations to read, from the first on; all by default.
-        episodes: numbers of the episodes to read; all by default.
-
-    Returns:
-        Steps for :meth:`Task.of <warmprior.training.Task.of>`, with ``"observation"`` ``[N, d_o]`` and
-        ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if a feature does not exist or is not a vector of numbers, there are fewer
-            demonstrations, or the dataset is damaged.
-        OSError: if a download fails.
-
-    Examples:
-        >>> from warmprior.data import lerobot_steps
-        >>> steps = lerobot_steps("lerobot/pusht_keypoints")  # doctest: +SKIP
-        >>> steps["action"].shape  # doctest: +SKIP
-        torch.Size([25650, 2])
-    """
-    chosen: dict[str, Any] = {"demos": demos, "episodes": episodes}
-    data = LeRobotDemonstrations(dataset, observation_keys=observation_keys, **chosen).data
-    return data.select(OBSERVATION, ACTION, EPISODE)

@@ -33,7 +33,7 @@ from warmprior import (
     keys,
 )
 from warmprior.checks import check_choice
-from warmprior.data import lerobot_steps
+from warmprior.data import LeRobotDemonstrations
 from warmprior.history import window_history
 from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
@@ -155,7 +155,8 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 "choose that, or --policy.precondition=false"
             )
         episodes = training_episodes(dataset_meta)
-        steps = lerobot_steps(dataset_meta.root, self.config.observed, episodes=episodes)
+        chosen: Any = {"observation_keys": self.config.observed, "episodes": episodes}
+        steps = LeRobotDemonstrations(dataset_meta.root, **chosen).data.copy()
         # LeRobot's own step, because it maps a constant dimension to -1.
         features = {keys.ACTION: self.config.action_feature}
         norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
