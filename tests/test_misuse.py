@@ -11,7 +11,15 @@ from torchrl.record.loggers.csv import CSVLogger
 
 from tests.errors import raises
 from tests.toy_env import demonstrations, mlp_actor
-from warmprior import PastPrior, RealTimeChunking, VelocityMLP, policy_transforms, window_transforms
+from warmprior import (
+    PastPrior,
+    PriorDecoder,
+    RealTimeChunking,
+    ResidualSampler,
+    VelocityMLP,
+    policy_transforms,
+    window_transforms,
+)
 from warmprior.training import BehaviourCloning, NetworkOptions, TrainingConfig, ema_of, train_policy
 
 PRIOR = PastPrior(4)
@@ -32,12 +40,39 @@ def test_a_step_that_the_data_do_not_hold():
             windows(TensorDict({"frame": torch.tensor([0, frame])}, [2]))
 
 
-def test_a_generator_stays_in_its_process():
-    """Workers that were all given one would draw the same noise."""
-    policy = actor(generator=torch.Generator())
-    process = multiprocessing.get_context("spawn").Process(target=partial(policy, None))
-    with raises(RuntimeError, "set_seed"):
-        process.start()
+def sent(module, monkeypatch):
+    """The copy of a module that a worker process gets."""
+    with monkeypatch.context() as patch:
+        patch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())
+        return pickle.loads(pickle.dumps(module))
+
+
+def test_a_generator_stays_in_its_process(monkeypatch):
+    """Workers that were all given one would draw the same noise, so they say so where they draw."""
+    policy, data = actor(generator=torch.Generator()), window_transforms(steps(), PRIOR, observation_steps=1)
+    decoder = PriorDecoder(policy, delta=0.5)
+    batch = data(TensorDict({"frame": torch.tensor([3])}, [1])).set("prior", {"anchor": torch.zeros(1, 4, 1)})
+    for module in (policy, ResidualSampler(decoder, generator=torch.Generator())):
+        copy = sent(module, monkeypatch)
+        with raises(RuntimeError, "same noise", "set_seed"):
+            copy(batch.copy())
+        assert module(batch.copy()) is not None
+    assert sent(policy, monkeypatch)(batch.copy(), generator=torch.Generator()) is not None
+    assert sent(actor(), monkeypatch)(batch.copy()) is not None
+
+
+def act_forever(policy):
+    raise AssertionError("this process only has to start")
+
+
+def test_a_policy_with_a_generator_can_be_sent():
+    """An error while TorchRL's collectors send a policy would leave its weights on the device meta."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=act_forever, args=[actor(generator=torch.Generator())]
+    )
+    process.start()
+    process.join(60)
+    assert process.exitcode == 1
 
 
 def test_a_training_is_of_its_units(tmp_path):

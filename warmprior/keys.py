@@ -12,7 +12,7 @@ constant                key                                    shape and dtype
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
 :data:`STATE`           ``"state"``, nested under observation  ``[*B, To, d_s]`` float
 :data:`FEATURES`        ``"features"``, of an encoder           ``[*B, To, d_o]`` float
-:data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + H * d_a + 1]`` float
+:data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + n * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
 :data:`SIM_STATE`       ``"sim_state"``                        ``[*B, 1 + nq + nv]`` float64, raw

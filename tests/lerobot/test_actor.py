@@ -179,6 +179,8 @@ def test_names_of_cameras_that_end_alike_or_do_not_exist():
 
 
 def test_a_generator_does_not_go_to_worker_processes(policy, monkeypatch):
-    monkeypatch.setattr("warmprior.modules.actor.get_spawning_popen", lambda: object())
+    actor = actor_of(policy("smolvla"), PastPrior(LENGTH))
+    assert pickle.loads(pickle.dumps(actor)).generator is not None
+    monkeypatch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())
     with raises(RuntimeError, "same noise"):
-        pickle.dumps(actor_of(policy("smolvla"), PastPrior(LENGTH)))
+        pickle.loads(pickle.dumps(actor)).chosen_generator()

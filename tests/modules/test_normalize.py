@@ -2,12 +2,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
 from tests.toy_env import ACTION_DIM, CountingEnv
-from warmprior import Normalizer
+from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
 
 
 def data(n=40):
@@ -143,3 +143,16 @@ def test_entries_of_an_observation_are_named_one_by_one():
         Normalizer.fit(raw)
     nested = Normalizer.fit(raw, (("observation", "state"), "action"))
     assert nested.normalize(raw)["observation", "state"].amax() <= 1.0001
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_a_cast_policy_keeps_its_units(dtype):
+    """The offset is large beside the range, so that half precision would lose it."""
+    data = TensorDict({"observation": 100 + torch.rand(9, 3) / 50, "action": torch.rand(9, 1)}, [9])
+    actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4), normalizer=Normalizer.fit(data))
+    expected = actor.normalizer.normalize(data)
+    actor.to(dtype)
+    assert next(actor.network.parameters()).dtype == dtype
+    assert (actor.normalizer.normalize(data) == expected).all()
+    check_env_specs(TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor)))
+    assert actor.normalizer.to("meta").loc("action").device.type == "meta"

@@ -130,6 +130,37 @@ def test_no_pad_mask_counts_everything():
     assert torch.equal(loss_of(actor, data), loss_of(actor, none))
 
 
+@pytest.mark.parametrize("entry", ["observation", ("vla_action", "chunk"), ("history", "actions")])
+def test_what_a_mask_leaves_out_may_be_nan(entry):
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    kept = torch.arange(6) > 0
+    gradients = []
+    for batch in (data[1:], data.clone().set(("collector", "mask"), kept)):
+        if len(batch) == 6:
+            batch[entry][0] = float("nan")
+        actor.zero_grad()
+        noise = torch.Generator().manual_seed(0)
+        # The same source and times for the windows that count.
+        a0 = torch.randn(6, H, batch["vla_action", "chunk"].shape[-1], generator=noise)[-len(batch) :]
+        actor.prior.sample = lambda history, *_, a0=a0: a0 + history["actions"][..., -H:, :].sum() * 0
+        times = torch.linspace(0, 1, 6)[-len(batch) :]
+        loss = FlowMatchingLoss(actor, times=lambda *_, times=times: times)(batch)["loss_flow_matching"]
+        loss.backward()
+        gradients.append([p.grad.clone() for p in actor.parameters()])
+    for one, two in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, two)
+
+
+def test_a_padded_target_may_be_nan():
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    data["action_is_pad"][:, -1] = True
+    data["vla_action", "chunk"][:, -1] = float("nan")
+    loss_of(actor, data).backward()
+    assert all(p.grad.isfinite().all() for p in actor.parameters())
+
+
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 def test_only_padding_is_zero_and_not_nan(reduction):
     prior = PastPrior(H)

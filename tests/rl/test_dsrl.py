@@ -107,6 +107,31 @@ def test_losses_by_hand(prior_class, options, delta):
     assert not out["entropy"].requires_grad and not out["td_error"].requires_grad
 
 
+def test_the_state_after_an_end_may_be_nan():
+    """Some simulators that restart rows write that."""
+    loss, data = build(), batch()
+    blank = data.clone()
+    for key in ("observation", ("prior", "anchor")):
+        blank["next", key][data["next", "done"].squeeze(-1)] = math.nan
+    losses = []
+    for one in (data, blank):
+        torch.manual_seed(5)
+        losses.append(loss(one)["loss_qvalue"])
+    torch.testing.assert_close(*losses)
+
+
+def test_decisions_that_multistep_joins():
+    joined = batch().set("steps_to_next_obs", torch.full((N, 1), 3))
+    with raises(ValueError, "MultiStep", "discount='decision'"):
+        build()(joined)
+    loss, plain, found = build(discount="decision"), batch(), []
+    for data, gamma in ((joined, GAMMA), (plain, GAMMA**3)):
+        loss.make_value_estimator(gamma=gamma)
+        torch.manual_seed(5)
+        found.append(loss(data)["loss_qvalue"])
+    torch.testing.assert_close(*found)
+
+
 @pytest.mark.parametrize("distribution", ["normal", "clipped", "truncated", "uniform"])
 def test_distillation_by_hand(distribution):
     """Head by head, online action critics at decoded draws; the gradient is the noise critics' alone."""

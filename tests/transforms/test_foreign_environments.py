@@ -10,6 +10,7 @@ from torchrl.envs import (
     ActionDiscretizer,
     Compose,
     ConditionalSkip,
+    FrameSkipTransform,
     GymEnv,
     ParallelEnv,
     SerialEnv,
@@ -117,6 +118,14 @@ def test_windows_and_policies_of_whole_numbers(dtype):
 def every_second(tensordict):
     """Skip where the last decision executed something."""
     return tensordict[keys.EXECUTED] > 0
+
+
+def test_a_chunk_is_not_repeated():
+    env = TransformedEnv(CountingEnv(30), Compose(*policy_transforms(PRIOR), FrameSkipTransform(2)))
+    with raises(RuntimeError, "FrameSkipTransform", "before"):
+        env.reset()
+    env = TransformedEnv(CountingEnv(30), Compose(FrameSkipTransform(2), *policy_transforms(PRIOR)))
+    assert env.step(POLICY(env.reset()))["next", keys.EXECUTED] == H
 
 
 @pytest.mark.parametrize("rows", [(), (9, 30)])

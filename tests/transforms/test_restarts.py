@@ -175,9 +175,10 @@ def test_batches_inside_of_workers_take_single_steps():
     def make():
         return AutoResetEnv(Auto(restarts=True), AutoResetTransform())
 
-    env = TransformedEnv(SerialEnv(2, make), policy_transforms(PRIOR, execute=2))
-    with raises(RuntimeError, "execute=1"):
-        env.reset()
+    for batched in (make, Rows):
+        env = TransformedEnv(SerialEnv(2, batched), policy_transforms(PRIOR, execute=2))
+        with raises(RuntimeError, "execute=1"):
+            env.reset()
 
 
 class Walk(gymnasium.Env):

@@ -19,7 +19,7 @@ from warmprior.history import history_keys
 from warmprior.lerobot.adapter import WarmPriorAdapter
 from warmprior.lerobot.names import entry_names
 from warmprior.lerobot.source import ChunkSource
-from warmprior.modules.actor import check_unshared
+from warmprior.modules.generator import Drawing
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior, noise_factor
@@ -120,7 +120,7 @@ class LeRobotFlow(TensorDictModuleBase):
         return inputs if self.preprocess is None else self.preprocess(inputs)
 
 
-class LeRobotActor(TensorDictModuleBase):
+class LeRobotActor(Drawing, TensorDictModuleBase):
     """A LeRobot policy with the keys of :class:`~warmprior.WarmPriorActor`.
 
     ``(observation, history) -> (loc, warm, noise, chunk)``: it acts in ``env.rollout`` and collectors behind
@@ -203,10 +203,6 @@ class LeRobotActor(TensorDictModuleBase):
         self.in_keys = [keys.OBSERVATION, *history_keys()]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
 
-    def __getstate__(self) -> Any:
-        check_unshared(self.generator)
-        return super().__getstate__()
-
     @property
     def prior(self) -> Prior:
         """The source distribution."""
@@ -234,7 +230,7 @@ class LeRobotActor(TensorDictModuleBase):
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Draw the source and the chunk."""
-        chunks, generator = self.ode.source, self.generator if generator is None else generator
+        chunks, generator = self.ode.source, self.chosen_generator(generator)
         source = chunks.distribution(tensordict.get(keys.HISTORY, None))
         loc, a0 = (
             chunks.scaled(v, source.warm)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import torch
@@ -16,20 +15,12 @@ from torchrl.data import Composite, TensorSpec
 
 from warmprior import keys
 from warmprior.history import history_keys
+from warmprior.modules.generator import Drawing
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, Sampling
 from warmprior.modules.prior import Prior, Source, noise_factor
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
-
-
-def check_unshared(generator: torch.Generator | None) -> None:
-    """Raise RuntimeError if a policy with a generator is on its way to a worker process."""
-    if generator is not None and get_spawning_popen() is not None:
-        raise RuntimeError(  # TorchRL's collectors swallow a TypeError
-            "a policy with a generator cannot go to worker processes: all of them would draw the same noise. "
-            "Build it without one (generator=None), and seed the collector with set_seed"
-        )
 
 
 class StartPoint(Registered, nn.Module):
@@ -67,7 +58,7 @@ class StartPoint(Registered, nn.Module):
         raise NotImplementedError
 
 
-class PriorSampler(TensorDictModuleBase):
+class PriorSampler(Drawing, TensorDictModuleBase):
     """Draws the source sample: ``(observation, history) -> (loc, warm, noise)``.
 
     Args:
@@ -78,7 +69,7 @@ class PriorSampler(TensorDictModuleBase):
         history_key: key of the history (:mod:`warmprior.history`).
         source_key: where to write ``"loc"``, ``"warm"`` and ``"noise"``.
         generator: source of randomness, also per call: ``sampler(data, generator=...)``. A sampler with a
-            generator cannot go to worker processes, since all of them would draw the same noise.
+            generator cannot draw in worker processes, since all of them would draw the same noise.
 
     Raises:
         KeyError: if an entry of the history is missing.
@@ -115,10 +106,6 @@ class PriorSampler(TensorDictModuleBase):
         self.in_keys = [*history_keys(history_key), *observed]
         self.out_keys = [unravel_key((source_key, name)) for name in ("loc", "warm", "noise")]
 
-    def __getstate__(self) -> Any:
-        check_unshared(self.generator)
-        return super().__getstate__()
-
     def source(self, tensordict: TensorDictBase) -> Source:
         """Return the source for decisions or windows ``[*B]``."""
         return self.prior.distribution(*self._inputs(tensordict))
@@ -131,8 +118,8 @@ class PriorSampler(TensorDictModuleBase):
         temperature: float | None = None,
     ) -> TensorDictBase:
         """Write the mean, the mask of warm positions, and a sample at a temperature."""
-        source, generator = self.source(tensordict), self.generator if generator is None else generator
-        point = source.sample(generator, noise_factor(temperature))
+        source = self.source(tensordict)
+        point = source.sample(self.chosen_generator(generator), noise_factor(temperature))
         if self.start is not None:
             point = self.start(point, *self._inputs(tensordict))
         for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -35,7 +35,8 @@ class Normalizer(nn.Module):
     """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
     A dimension counts as constant, and is only shifted, if half its range is at most ``1e-5 * max(1,
-    |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers.
+    |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers; they keep their precision
+    where a policy is cast to another.
 
     Args:
         low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.
@@ -69,6 +70,15 @@ class Normalizer(nn.Module):
             constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Self:
+        """Move the statistics, and keep their precision: that of a network is too low for raw units."""
+
+        def moved(value: Tensor) -> Tensor:
+            result = fn(value)
+            return result if result.dtype == value.dtype else value.to(result.device)
+
+        return super()._apply(moved, recurse)
 
     @classmethod
     def fit(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, cast, get_args
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
@@ -174,6 +174,13 @@ class FlowMatchingLoss(LossModule):
         device = device_of(actor.network, tensordict.get(k.chunk))
         a1, history, observation = (tensordict.get(key).to(device) for key in needed)
         check_positions(k.chunk, a1, actor.prior)
+        weight, masked = self._weight(tensordict, a1)
+        if weight is not None:
+            # What has no weight may be NaN, and would make all gradients NaN.
+            unused = weight == 0
+            a1 = _blanked(a1, unused)
+            if masked:
+                history, observation = (_blanked(part, unused.all(-1)) for part in (history, observation))
         a0 = actor.prior.sample(history, observation, self.generator)
         if self.coupling is not None:
             a0, a1 = self.coupling(a0, a1, observation)
@@ -181,20 +188,21 @@ class FlowMatchingLoss(LossModule):
         a_t, velocity = self.interpolant(a0, a1, t, self.generator)
         field = velocity_field(actor.network, network_observation(observation, a1.shape[:-2]))
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
-        loss = self._reduced(self._error(predicted, velocity, t), self._weight(tensordict, a1))
+        loss = self._reduced(self._error(predicted, velocity, t), weight)
         return TensorDict({self.out_keys[0]: loss}, batch_size=[])
 
-    def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> Tensor | None:
-        """Return the positions' weights ``[*B, P]``, or ``None`` if all are equal."""
+    def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> tuple[Tensor | None, bool]:
+        """Return the positions' weights ``[*B, P]``, ``None`` if all are equal, and if windows are masked."""
         pad, weight = tensordict.get(self.tensor_keys.pad_mask, None), None
-        factors = [None if pad is None else ~pad, self._maybe_get_priority_weight(tensordict)]
-        factors += [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        factors = [None if pad is None else ~pad, self._maybe_get_priority_weight(tensordict), *masks]
         for factor in factors:
             if factor is not None:
                 # A factor weights windows `[*B]` or `[*B, 1]`, or positions `[*B, P]`.
                 factor = factor.to(a1).reshape(*factor.shape, *(1,) * (a1.ndim - 1 - factor.ndim))
                 weight = factor if weight is None else weight * factor
-        return None if weight is None else weight.expand(a1.shape[:-1])
+        masked = any(mask is not None for mask in masks)
+        return None if weight is None else weight.expand(a1.shape[:-1]), masked
 
     def _error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
         """Return the objective's error ``[*B, P, d_a]`` of velocities predicted at times ``t`` ``[*B]``."""
@@ -208,10 +216,18 @@ class FlowMatchingLoss(LossModule):
         """Reduce errors ``[*B, P, d_a]`` with weights ``[*B, P]``."""
         count: Tensor | int = max(1, error.numel())
         if weight is not None:
-            # Errors without weight may be NaN. If no error has weight, the mean is 0.
-            error = torch.where(weight.unsqueeze(-1) == 0, 0.0, error * weight.unsqueeze(-1))
+            error = error * weight.unsqueeze(-1)  # if no error has weight, the mean is 0
             total = weight.sum() * error.shape[-1]
             count = torch.where(total > 0, total, 1.0)
         if self.reduction == "none":
             return error
         return error.sum() / count if self.reduction == "mean" else error.sum()
+
+
+def _blanked[T: Tensor | TensorDictBase](value: T, unused: Tensor) -> T:
+    """Return a value with 0 in place of NaN and infinity in unused rows ``[*B]`` or positions ``[*B, P]``."""
+    if isinstance(value, TensorDictBase):
+        return cast(T, value.apply(lambda entry: _blanked(entry, unused)))
+    if not value.is_floating_point():
+        return value
+    return cast(T, value.masked_fill(expand_as_right(unused, value) & ~value.isfinite(), 0.0))

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positive, check_shape
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
+from warmprior.modules.generator import Drawing
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
@@ -211,7 +212,7 @@ class PriorSpace(EnvTransform):
 ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
 
 
-class ResidualSampler(TensorDictModuleBase):
+class ResidualSampler(Drawing, TensorDictModuleBase):
     r"""A sampler of residuals without an agent, for the warm-up and for distilling the noise critic.
 
     ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
@@ -271,12 +272,13 @@ class ResidualSampler(TensorDictModuleBase):
         """Write the residual."""
         check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
         anchor = tensordict.get(self.in_keys[0])
-        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
+        generator = self.chosen_generator()
+        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": generator}
         if self.distribution == "uniform":
             delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
         elif self.distribution == "truncated":
             box = (-self.delta, self.delta)
-            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=self.generator)
+            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=generator)
         else:
             delta = self.sigma * torch.randn(anchor.shape, **like)
         if self.distribution == "clipped":

@@ -29,11 +29,15 @@ from warmprior.checks import (
 )
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.networks import BoxTanhNormal
+from warmprior.transforms.inner_step import rows_where
 
 type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2
 """The number of critics of each kind; the smaller of their values is used."""
+
+STEPS = "steps_to_next_obs"
+"""TorchRL's key of the decisions up to the next state, which its ``MultiStep`` writes."""
 
 ELSEWHERE = (
     ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
@@ -262,12 +266,14 @@ class DSRLNALoss(LossModule):
         with torch.no_grad():
             after = tensordict.get("next")
             state = after.select(*self._states(self.actor_network, self.decoder, self.qvalue_network))
+            # The state after an end has no value, and some simulators write NaN there.
+            state = rows_where(~after.get(self.tensor_keys.done).squeeze(-1), state, tensordict)
             delta, log_prob = self._act(state)
             state = self.decoder(state.set(keys.DELTA, delta))
             value = self._values(self._vmap_qvalue(state, self.target_qvalue_network_params)).amin(0)
             if self.backup_entropy:
                 value = value - alpha * log_prob
-            target = self._td_target(after, value)
+            target = self._td_target(after, value, tensordict.get(STEPS, None))
         state = tensordict.select(*self._states(self.qvalue_network))
         state.set(keys.CHUNK, tensordict.get(self.tensor_keys.chunk))
         error = self._values(self._vmap_qvalue(state, self.qvalue_network_params)) - target
@@ -285,7 +291,7 @@ class DSRLNALoss(LossModule):
         loss = 0.5 * (value - target).square().sum(0)
         return self._finish({"loss_qvalue_noise": loss}, tensordict, weights)
 
-    def _td_target(self, after: TensorDictBase, value: Tensor) -> Tensor:
+    def _td_target(self, after: TensorDictBase, value: Tensor, steps: Tensor | None) -> Tensor:
         k = self.tensor_keys
         estimator = self.value_estimator
         e = estimator.tensor_keys
@@ -295,7 +301,14 @@ class DSRLNALoss(LossModule):
         for flag in (e.done, e.terminated):  # time-outs are terminations, as in the official implementation
             data.set(("next", flag), after.get(k.done))
         if self.discount == "step":
-            data.set(e.steps_to_next_obs, after.get(k.executed))
+            if steps is not None and bool((steps > 1).any()):
+                raise ValueError(
+                    f"{STEPS!r} says that a next state is several decisions later (MultiStep), and nothing "
+                    "says how many control steps: leave MultiStep out, or take discount='decision'"
+                )
+            steps = after.get(k.executed)
+        if steps is not None:
+            data.set(e.steps_to_next_obs, steps)
         return estimator.value_estimate(data, next_value=value.view_as(reward)).squeeze(-1)
 
     def _act(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:

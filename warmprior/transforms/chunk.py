@@ -15,6 +15,7 @@ from torchrl.envs.transforms import (
     ActionDiscretizer,
     ActionScaling,
     ConditionalSkip,
+    FrameSkipTransform,
     ObservationNorm,
     Transform,
     TransformedEnv,
@@ -26,6 +27,7 @@ from warmprior.modules.normalize import FloatNorm
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
+from warmprior.transforms.restarts import flat
 from warmprior.transforms.stack import ObservationStack
 
 _REACH: dict[type[Transform], Callable[[Any], int]] = {
@@ -286,9 +288,21 @@ class ChunkStep(EnvTransform):
                 if why := _REFUSED.get(type(transform)):
                     raise RuntimeError(f"ChunkStep cannot come after {type(transform).__name__}, {why}")
             self._check_shapes(inner.base, parent)
+            self._check_later()
             late = LateTransforms.of(inner, read, self.in_keys_inv)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
+
+    def _check_later(self) -> None:
+        """Raise RuntimeError if a later transform would execute a chunk several times in a decision."""
+        container = self.container
+        transforms = list(flat(container.transform)) if isinstance(container, TransformedEnv) else [self]
+        place = next(i for i, transform in enumerate(transforms) if transform is self)
+        if any(isinstance(transform, FrameSkipTransform) for transform in transforms[place:]):
+            raise RuntimeError(
+                "FrameSkipTransform after ChunkStep would repeat chunks, of which the history sees one: "
+                "append it before, where it repeats single actions"
+            )
 
     def _check_shapes(self, base: EnvBase, parent: EnvBase) -> None:
         """Raise RuntimeError unless every row has one end flag and observations of the same shapes."""

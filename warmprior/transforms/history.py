@@ -156,11 +156,12 @@ class WithheldHistory(Transform):
 
 
 class HistoryObservation(EnvTransform):
-    """A transform that appends the last ``H`` actions to the observation, in environments and replay buffers.
+    """A transform that appends the last ``n`` actions to the observation, in environments and replay buffers.
 
-    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``: the flattened actions (zero until there
-    are ``H``) and a flag that is 1 once there are ``H``, repeated over the observation steps. Build the
-    network with ``observation_dim = d_o + HistoryObservation.width(H, d_a)`` and the policy with
+    ``n`` is the prior's ``history_length``, usually ``H``. It writes ``keys.CONDITIONED``, ``[*B, To, d_o + n
+    * d_a + 1]``: the flattened actions (zero until there are ``n``) and a flag that is 1 once there are
+    ``n``, repeated over the observation steps. Build the network with ``observation_dim = d_o +
+    HistoryObservation.width(n, d_a)`` and the policy with
     ``observation_key=keys.CONDITIONED``. In an environment, append it after
     :class:`~warmprior.ActionHistory`.
 
@@ -191,7 +192,7 @@ class HistoryObservation(EnvTransform):
 
     @staticmethod
     def width(history_length: int, action_dim: int) -> int:
-        """Return the number of entries added to the observation, ``H * d_a + 1``."""
+        """Return the number of entries added to the observation, ``n * d_a + 1``."""
         return history_length * action_dim + 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -46,7 +46,7 @@ class Restarts:
         self._base: EnvBase = container.base_env
         simulator, below = self._base, list(transforms)
         while isinstance(simulator, TransformedEnv):
-            below += _flat(simulator.transform)
+            below += flat(simulator.transform)
             simulator = simulator.base_env
         mode = getattr(simulator, "autoreset_mode", None) if isinstance(simulator, GymWrapper) else None
         self._mode = getattr(mode, "name", None)
@@ -54,11 +54,8 @@ class Restarts:
         self.native = several and bool(container.__dict__.get(NATIVE, False))
         self.needed = several and self._mode == "DISABLED"
         alone = any(isinstance(t, _BY_THEMSELVES) for t in below)
-        if isinstance(simulator, BatchedEnvBase) and simulator.batch_size[1:].numel() > 1:  # in each worker
-            described = simulator.meta_data
-            texts = [part.env_str for part in (described if isinstance(described, list) else [described])]
-            alone = alone or any(kind.__name__ in text for kind in _BY_THEMSELVES for text in texts)
         self._alone = several and alone and not self.native
+        self._whole_workers = isinstance(simulator, BatchedEnvBase) and simulator.batch_size[1:].numel() > 1
 
     def check(self, execute: int) -> None:
         """Raise RuntimeError if chunks of ``execute`` actions would go on in the next episode."""
@@ -67,6 +64,12 @@ class Restarts:
             raise RuntimeError(
                 f"Gymnasium's AutoresetMode.NEXT_STEP ignores the first action of every episode: {vector}, "
                 "and give it to GymWrapper"
+            )
+        if self._whole_workers and execute > 1:
+            raise RuntimeError(
+                "every worker has several rows, and TorchRL steps them together, also where an episode has "
+                "ended inside a chunk: append the transforms to the environments inside the workers, or use "
+                f"execute=1, not {execute}"
             )
         if self._alone and execute > 1:
             raise RuntimeError(
@@ -90,9 +93,10 @@ class Restarts:
             ) from error
 
 
-def _flat(transform: Transform) -> Iterator[Transform]:
+def flat(transform: Transform) -> Iterator[Transform]:
+    """Yield a transform, or all that it is composed of, in their order."""
     if isinstance(transform, Compose):
         for part in transform:
-            yield from _flat(part)
+            yield from flat(part)
     else:
         yield transform
