@@ -133,6 +133,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         (["evaluate", str(tmp_path / "missing")], f"{tmp_path}/missing"),
         (["evaluate", str(bare)], "environment"),
         (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
+        (["evaluate", str(saved[0]), "--nfe"], "--nfe"),
         (["evaluate", str(saved[0]), "--grid", "sparse"], "'sparse'"),
         (["evaluate", str(saved[0]), "--episodes", "0"], "episodes"),
         (["evaluate", str(saved[0]), "--import", "no.such"], "'no'"),
@@ -163,7 +164,12 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("words", "fact"),
-    [("--prior nobodys", "'nobodys'"), ("", "missing.hdf5"), ("--chunk 0", "chunk_length")],
+    [
+        ("--prior nobodys", "'nobodys'"),
+        ("", "missing.hdf5"),
+        ("--chunk 0", "chunk_length"),
+        ("--iterations 0", "iterations"),
+    ],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, fact):
     said = refused(["train", "missing.hdf5", *words.split(), "--out", str(tmp_path / "out")], capsys)

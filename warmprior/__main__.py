@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from warmprior.checks import check_whole_numbers, given
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.script import run_script
+from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import DEFAULT_NFE
@@ -48,7 +49,7 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     Args:
         folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
             Hugging Face hub
-        revision: branch, tag or commit of the repository (default: main)
+        revision: branch, tag or commit of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
     from warmprior.deploy.observation import observation_shapes
@@ -89,11 +90,11 @@ def push(
     Args:
         folder: folder of the policy, such as .../policy_010000
         repository: user/name of the repository, created if needed
-        card: file with the model card, as benchmarks/card.py writes it (default: generated)
+        card: file with the model card, as benchmarks/card.py writes it; by default generated
         private: make the repository private if it is created
         licence: licence of the policy in the hub's spelling, such as mit
         dry_run: print the card and upload nothing
-        revision: branch of the repository (default: main)
+        revision: branch of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
     from warmprior.training.card import model_card
@@ -116,7 +117,7 @@ def evaluate(
     /,
     *,
     episodes: int = 50,
-    nfe: tuple[int, ...] = (),
+    nfe: tuple[int, ...] | None = None,
     temperature: float | None = None,
     grid: str | None = None,
     first_seed: int = EVALUATION_SEED,
@@ -132,14 +133,14 @@ def evaluate(
         folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
             Hugging Face hub
         episodes: number of episodes
-        nfe: network evaluations per chunk, one or several values (default: the policy's)
-        temperature: factor on the noise of the source, from 0 on (default: the policy's, or 1)
-        grid: times of the steps: uniform, dense-jump or dense-jump:TIME (default: the policy's)
+        nfe: network evaluations per chunk, one or several; by default the policy's
+        temperature: factor on the noise of the source, from 0 on; by default the policy's, or 1
+        grid: times of the steps: uniform, dense-jump or dense-jump:TIME; by default the policy's
         first_seed: simulator seed of the first episode
         policy_seed: seed of the source samples
         play_on: play on after success, up to the time limit
         video: MP4 file to write of the first episode; needs EGL or OSMesa, and PyAV
-        revision: branch, tag or commit of the repository (default: main)
+        revision: branch, tag or commit of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
     from warmprior.diagnostics.statistics import success_posterior
@@ -148,8 +149,10 @@ def evaluate(
     from warmprior.training.video import check_video, record_filmstrip
 
     check_whole_numbers(**{"--episodes": episodes})
+    if nfe == ():
+        raise ValueError("--nfe needs a number of network evaluations, or several")
     actor = _policy(folder, revision, modules)
-    nfes = [actor.sampling.evaluations(n) for n in nfe or [None]]
+    nfes = [actor.sampling.evaluations(n) for n in (nfe or [None])]
     actor = actor.replace(**given(temperature=temperature, grid=grid))
     if video is not None:  # before the episodes are played
         check_video(video, actor)
@@ -195,14 +198,14 @@ class Data:
     """The options of :meth:`Task.open`.
 
     Attributes:
-        observation_keys: observations of the policy, in this order (default: the task's)
+        observation_keys: observations of the policy, in this order; by default the task's
         joint_key: observation of the joint positions that absolute actions target, such as
             observation.state
         image_keys: images of the policy, in addition to the robot's state, such as agentview_image
         fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
-        mask: mask of the file, such as train, whose demonstrations to use (default: all)
-        demonstrations: number of demonstrations, from the first on (default: all)
+        mask: mask of the file, such as train, whose demonstrations to use; by default all
+        demonstrations: number of demonstrations, from the first on; by default all
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit (default: ph, and human
             outside robosuite)
@@ -246,8 +249,8 @@ def train(
             past,sigma=0.3
         chunk: chunk length H
         nfe: network evaluations per chunk, saved with the policy
-        held_out: number of last demonstrations to leave out for measuring the error of actions (default: a
-            tenth if no environment is known, else none)
+        held_out: number of last demonstrations to leave out for measuring the error of actions; by default
+            a tenth if no environment is known, else none
         out: folder of training runs, in which an interrupted one continues
         device: device of the network, such as cuda
     """
@@ -322,8 +325,8 @@ def convert(
         file: robomimic HDF5 file
         folder: folder to write, which must not exist
         images: include the file's images as lossless pictures (image), or as lossy, smaller videos (video)
-        observation_keys: observations to write (default: the task's)
-        demonstrations: number of demonstrations, from the first on (default: all)
+        observation_keys: observations to write; by default the task's
+        demonstrations: number of demonstrations, from the first on; by default all
     """
     from warmprior.data import convert_robomimic
 
@@ -340,7 +343,7 @@ def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> N
     Args:
         file: recording, such as demo.hdf5 of robosuite's collect_human_demonstrations
         out: robomimic HDF5 file to write, which must not exist
-        demonstrations: number of demonstrations, from the first on (default: all)
+        demonstrations: number of demonstrations, from the first on; by default all
     """
     from warmprior.data import observe_recordings
 
@@ -353,13 +356,34 @@ COMMANDS = (info, push, evaluate, train, convert, observe)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run command-line arguments, and return the exit code. User errors are reported in one line."""
     argv = sys.argv[1:] if argv is None else argv
-    if list(argv) == ["--version"]:
+    if list(argv[:1]) == ["--version"]:
         print(f"warmprior {version('warmprior')}")
         return 0
-    commands: dict[str, Any] = {command.__name__: command for command in COMMANDS}
-    options: Any = {"prog": "python -m warmprior", "description": __doc__, "args": argv}
-    options["config"] = (tyro.conf.OmitArgPrefixes,)  # --iterations, not --training.iterations
-    return run_script(lambda: tyro.extras.subcommand_cli_from_dict(commands, **options), "warmprior")
+
+    def run() -> None:
+        parsed: Any = read_command_line(
+            partial(
+                tyro.extras.subcommand_cli_from_dict,
+                {command.__name__: _deferred(command) for command in COMMANDS},
+                prog="python -m warmprior",
+                description=f"{__doc__}\n\nOptions of a command: COMMAND --help. The version: --version.",
+                args=argv,
+                config=(tyro.conf.OmitArgPrefixes,),  # --iterations, not --training.iterations
+            )
+        )
+        parsed()
+
+    return run_script(run, "warmprior")
+
+
+def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return a function with the same options, whose result runs the command."""
+
+    @wraps(command)
+    def bound(*args: Any, **options: Any) -> Callable[[], None]:
+        return partial(command, *args, **options)
+
+    return bound
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager
+from functools import partial
 from glob import escape
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,12 +20,10 @@ from lab.machine import check_device, facts_of_machine
 from lab.options import Options, with_parts
 from lab.presets import adapted
 from lab.stored_options import check_same, check_typed, of_run, recorded, stored_options
-from lab.tasks import (
-    resolved_place,
-)
+from lab.tasks import resolved_place
 from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import check_writable, exclusive, write_atomic
-from warmprior.io.script import run_script
+from warmprior.io.script import read_command_line, run_script
 
 
 def parse[O: Options](
@@ -85,20 +83,11 @@ def parse[O: Options](
 
 def read[O](default: O, argv: Sequence[str], description: str | None) -> O:
     """Read a command line on top of defaults."""
-    stderr = io.StringIO()
     # tyro joins lines, unless they begin with a symbol.
     description = re.sub(r"^(?=python |torchrun )", "$ ", description or "", flags=re.M)
-    try:
-        with redirect_stderr(stderr):
-            kind: Any = type(default)
-            return tyro.cli(kind, default=default, args=argv, description=description)
-    except SystemExit as stop:
-        # Errors of our dataclasses are reported in one line like all others; tyro reports unknown options.
-        cause: Any = stop.__context__
-        if isinstance(getattr(cause, "arg", None), str):
-            raise ValueError(str(cause.message)) from None
-        sys.stderr.write(stderr.getvalue())
-        raise
+    kind: Any = type(default)
+    # Errors of our dataclasses are reported in one line like all others.
+    return read_command_line(partial(tyro.cli, kind, default=default, args=argv, description=description))
 
 
 def output_folder(options: Options, study: str) -> Path:

@@ -76,7 +76,7 @@ def branching_cost(
     n, steps = len(windows), policy.prior.chunk_length
     rows = windows.repeat(draws)
     path = getattr(policy.network, "interpolant", LinearInterpolant())
-    generator = policy.sampler.generator if generator is None else generator
+    generator = policy.sampler.chosen_generator(generator)
     assert rows.target is not None
     with evaluation_mode(policy):
         a0 = policy.prior.sample(rows.history, rows.observation, generator)
@@ -236,7 +236,7 @@ def curvature(
     parts = []
     with evaluation_mode(policy):
         # All sources are drawn at once, so that splitting the batch does not change them.
-        generator = policy.sampler.generator if generator is None else generator
+        generator = policy.sampler.chosen_generator(generator)
         a0 = policy.prior.sample(rows.history, rows.observation, generator)
         for i in range(0, len(rows), SPLIT):
             s = slice(i, i + SPLIT)
@@ -304,7 +304,7 @@ def flow_paths(
     check_flow(policy, n_steps)
     windows = flat_windows(policy, batch)
     with evaluation_mode(policy):
-        generator = policy.sampler.generator if generator is None else generator
+        generator = policy.sampler.chosen_generator(generator)
         a0 = policy.prior.sample(windows.history, windows.observation, generator)
         field = velocity_field(policy.network, windows.observation)
         path = integrate(field, a0, nfe=n_steps, return_path=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
 import torch
@@ -73,3 +74,21 @@ def run_script(
     finally:
         signal.signal(signal.SIGINT, before)
     return 0
+
+
+def read_command_line[T](parse: Callable[[], T]) -> T:
+    """Read a command line with tyro, as ``parse`` does; tyro reports unknown options and exits.
+
+    Raises:
+        ValueError: if an option has a value that its dataclass refuses.
+    """
+    stderr = io.StringIO()
+    try:
+        with redirect_stderr(stderr):
+            return parse()
+    except SystemExit as stop:
+        cause: Any = stop.__context__
+        if isinstance(getattr(cause, "arg", None), str):
+            raise ValueError(str(cause.message)) from None
+        sys.stderr.write(stderr.getvalue())
+        raise

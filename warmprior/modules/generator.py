@@ -6,15 +6,14 @@ from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import torch
-from torch import nn
 
 
 class LeftBehind:
     """Stands for a generator in a worker process, where all workers would draw the same noise."""
 
 
-class Drawing(nn.Module):
-    """A module that draws from a generator of its own, PyTorch's global one without.
+class Drawing:
+    """A mixin of modules that draw from a generator of their own, PyTorch's global one without.
 
     It cannot draw in a worker process if it has one. An error while it is sent there would come when
     TorchRL's collectors have moved the weights away, and they would be lost.
@@ -23,7 +22,7 @@ class Drawing(nn.Module):
     generator: Any = None
 
     def __getstate__(self) -> Any:
-        state = super().__getstate__()
+        state: Any = super().__getstate__()
         if self.generator is not None and get_spawning_popen() is not None:
             state = {**state, "generator": LeftBehind()}
         return state

@@ -16,6 +16,7 @@ from torchrl.objectives.common import LossModule
 from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positions
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.generator import Drawing
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import device_of, network_observation, velocity_field
 from warmprior.objectives.times import Times, chosen_times
@@ -33,7 +34,7 @@ Objective = Literal["velocity", "l1"]
 Weighting = Literal["velocity", "standardised"]
 
 
-class FlowMatchingLoss(LossModule):
+class FlowMatchingLoss(Drawing, LossModule):
     r"""The conditional flow-matching loss with the actor's own source (Algorithm 1, training).
 
     For each window it draws :math:`a_0` from the prior, pairs it with :math:`a_1`, draws :math:`t \sim U(0,
@@ -157,7 +158,7 @@ class FlowMatchingLoss(LossModule):
                 "a velocity predicts the sample only on a straight path: use LinearInterpolant, not "
                 f"{type(self.interpolant).__name__}"
             )
-        self.generator = actor_network.sampler.generator if generator is None else generator
+        self.generator = actor_network.sampler.chosen_generator(generator)
         self.set_keys(observation=actor_network.observation_key)
 
     def _set_in_keys(self) -> None:
@@ -168,7 +169,7 @@ class FlowMatchingLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss of a batch of windows; raise KeyError if a needed key is missing."""
-        k, actor = self.tensor_keys, self.actor_network
+        k, actor, generator = self.tensor_keys, self.actor_network, self.chosen_generator()
         needed = (k.chunk, k.history, k.observation)
         check_keys(tensordict, needed, type(self).__name__, ". Take batches of window_replay_buffer")
         device = device_of(actor.network, tensordict.get(k.chunk))
@@ -176,16 +177,16 @@ class FlowMatchingLoss(LossModule):
         check_positions(k.chunk, a1, actor.prior)
         weight, masked = self._weight(tensordict, a1)
         if weight is not None:
-            # What has no weight may be NaN, and would make all gradients NaN.
+            # Masked windows and padded targets may be NaN, and would make all gradients NaN.
             unused = weight == 0
             a1 = _blanked(a1, unused)
             if masked:
                 history, observation = (_blanked(part, unused.all(-1)) for part in (history, observation))
-        a0 = actor.prior.sample(history, observation, self.generator)
+        a0 = actor.prior.sample(history, observation, generator)
         if self.coupling is not None:
             a0, a1 = self.coupling(a0, a1, observation)
-        t = self.times(a1.shape[:-2], self.generator, a1.dtype, a1.device)
-        a_t, velocity = self.interpolant(a0, a1, t, self.generator)
+        t = self.times(a1.shape[:-2], generator, a1.dtype, a1.device)
+        a_t, velocity = self.interpolant(a0, a1, t, generator)
         field = velocity_field(actor.network, network_observation(observation, a1.shape[:-2]))
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
         loss = self._reduced(self._error(predicted, velocity, t), weight)
@@ -216,7 +217,8 @@ class FlowMatchingLoss(LossModule):
         """Reduce errors ``[*B, P, d_a]`` with weights ``[*B, P]``."""
         count: Tensor | int = max(1, error.numel())
         if weight is not None:
-            error = error * weight.unsqueeze(-1)  # if no error has weight, the mean is 0
+            # Errors without weight may be infinite. If no error has weight, the mean is 0.
+            error = torch.where(weight.unsqueeze(-1) == 0, 0.0, error * weight.unsqueeze(-1))
             total = weight.sum() * error.shape[-1]
             count = torch.where(total > 0, total, 1.0)
         if self.reduction == "none":

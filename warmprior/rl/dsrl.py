@@ -246,6 +246,12 @@ class DSRLNALoss(LossModule):
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses of actor, temperature and action critic on transitions; write the TD errors."""
         check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
+        steps = tensordict.get(STEPS, None)
+        if steps is not None and bool((steps > 1).any()):
+            raise ValueError(
+                f"{STEPS!r} says that next states are several decisions later, but nothing says how many "
+                "control steps, nor whether an episode has ended there: leave MultiStep out"
+            )
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()
         loss_qvalue, td_error = self._qvalue_loss(tensordict, alpha)
@@ -273,7 +279,7 @@ class DSRLNALoss(LossModule):
             value = self._values(self._vmap_qvalue(state, self.target_qvalue_network_params)).amin(0)
             if self.backup_entropy:
                 value = value - alpha * log_prob
-            target = self._td_target(after, value, tensordict.get(STEPS, None))
+            target = self._td_target(after, value)
         state = tensordict.select(*self._states(self.qvalue_network))
         state.set(keys.CHUNK, tensordict.get(self.tensor_keys.chunk))
         error = self._values(self._vmap_qvalue(state, self.qvalue_network_params)) - target
@@ -291,7 +297,7 @@ class DSRLNALoss(LossModule):
         loss = 0.5 * (value - target).square().sum(0)
         return self._finish({"loss_qvalue_noise": loss}, tensordict, weights)
 
-    def _td_target(self, after: TensorDictBase, value: Tensor, steps: Tensor | None) -> Tensor:
+    def _td_target(self, after: TensorDictBase, value: Tensor) -> Tensor:
         k = self.tensor_keys
         estimator = self.value_estimator
         e = estimator.tensor_keys
@@ -301,14 +307,7 @@ class DSRLNALoss(LossModule):
         for flag in (e.done, e.terminated):  # time-outs are terminations, as in the official implementation
             data.set(("next", flag), after.get(k.done))
         if self.discount == "step":
-            if steps is not None and bool((steps > 1).any()):
-                raise ValueError(
-                    f"{STEPS!r} says that a next state is several decisions later (MultiStep), and nothing "
-                    "says how many control steps: leave MultiStep out, or take discount='decision'"
-                )
-            steps = after.get(k.executed)
-        if steps is not None:
-            data.set(e.steps_to_next_obs, steps)
+            data.set(e.steps_to_next_obs, after.get(k.executed))
         return estimator.value_estimate(data, next_value=value.view_as(reward)).squeeze(-1)
 
     def _act(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:
