@@ -43,10 +43,10 @@ Sets = Mapping[str, tuple[str | None, Sequence[str]]]
 """By name of the demonstrations: the task, or None if its runs have one task, and the runs of their rows."""
 
 HUMAN: Sets = {
-    DOOR: (None, ("door_20000",)),
-    "Push-T, 25": (None, ("pusht_25",)),
-    "Push-T, 50": (None, ("pusht_50",)),
-    "Push-T, 206": (None, ("pusht_206_45000",)),
+    DOOR: (None, ("door_20000", "door_20000_l1")),
+    "Push-T, 25": (None, ("pusht_25", "pusht_25_l1")),
+    "Push-T, 50": (None, ("pusht_50", "pusht_50_l1")),
+    "Push-T, 206": (None, ("pusht_206_45000", "pusht_206_45000_l1")),
 }
 SCRIPTED: Sets = {f"{task}, 25": (task, GROUPS[TWENTY_FIVE]) for task in ("square", "can", "stack")}
 TITLES = {
@@ -134,10 +134,11 @@ def draw() -> None:
 
 def table(sets: Sets) -> str:
     """Return the standings in Markdown."""
-    names, won_and_lost = ("mean", "best noise", *sets), pairs(sets)
+    frame, won_and_lost = standings(sets), pairs(sets)
+    names = [name for name in ("mean", "best noise", *sets) if frame[name].notna().any()]
     text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost |"]
     text.append("|---" * (4 + len(names)) + "|")
-    for _, row in standings(sets).iterrows():
+    for _, row in frame.iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f} to {row['rank_high']:.0f})"
         setting = row["source"], row["nfe"]
         pair = won_and_lost.loc[setting] if setting in won_and_lost.index else None
