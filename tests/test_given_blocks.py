@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 import warmprior.training
+from lab.couplings import ReflowCoupling
 from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import TOKEN, model_hub
@@ -87,7 +88,8 @@ def simulated(here):
 @pytest.fixture
 def parts(here):
     teacher = mlp_actor(GaussianPrior(8), action_dim=2, observation_dim=3)
-    return {"network": teacher.network, "teacher": teacher, "start": Halfway(), "demos": demonstrations()}
+    network, pairs = teacher.network, ReflowCoupling(teacher)
+    return {"network": network, "pairs": pairs, "start": Halfway(), "demos": demonstrations()}
 
 
 STAND_INS = {
@@ -97,7 +99,7 @@ STAND_INS = {
     places: "moves, joints, poses",
     adapted: "policy, preprocessor, postprocessor, batch, observation, fps",
     simulated: "policy, base",
-    parts: "network, teacher, start, demos",
+    parts: "network, pairs, start, demos",
 }
 BY_NAMES = {names: stand_in.__name__ for stand_in, names in STAND_INS.items()}
 GIVEN_BLOCKS = [  # but that of another release of LeRobot

@@ -23,11 +23,12 @@ class FloatNorm(ObservationNorm):
         return super()._apply_transform(obs if obs.is_floating_point() else obs.to(self.loc.dtype))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Set the spec of what is normalised, which is floating point."""
+        """Set the spec of what is normalised, which has the precision of the statistics, or a higher one."""
         for key in self.in_keys:
             leaf = observation_spec.get(key)
-            if leaf is not None and not leaf.dtype.is_floating_point:
-                observation_spec[key] = Unbounded(leaf.shape, dtype=self.loc.dtype, device=leaf.device)
+            dtype = self.loc.dtype if leaf is None else torch.promote_types(leaf.dtype, self.loc.dtype)
+            if leaf is not None and leaf.dtype != dtype:
+                observation_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)
         return super().transform_observation_spec(observation_spec)
 
 
@@ -36,7 +37,7 @@ class Normalizer(nn.Module):
 
     A dimension counts as constant, and is only shifted, if half its range is at most ``1e-5 * max(1,
     |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers; they keep their precision
-    where a policy is cast to another.
+    where a policy is cast to a lower one.
 
     Args:
         low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.
@@ -72,11 +73,12 @@ class Normalizer(nn.Module):
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 
     def _apply(self, fn: Any, recurse: bool = True) -> Self:
-        """Move the statistics, and keep their precision: that of a network is too low for raw units."""
+        """Move the statistics, and lower their precision never: a network's may be too low for raw units."""
 
         def moved(value: Tensor) -> Tensor:
             result = fn(value)
-            return result if result.dtype == value.dtype else value.to(result.device)
+            wide = torch.promote_types(result.dtype, value.dtype) == result.dtype
+            return result if wide else value.to(result.device)
 
         return super()._apply(moved, recurse)
 
