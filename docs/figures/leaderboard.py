@@ -123,7 +123,8 @@ def draw() -> None:
             part = frame[frame["source"] == source].sort_values("nfe")
             bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
             places = part["nfe"] * beside(k, len(shown))
-            axis.errorbar(places, part["mean"], bars, color=color, marker=mark, lw=1.6, label=label)
+            line = "--" if source.endswith(",l1") else "-"
+            axis.errorbar(places, part["mean"], bars, color=color, marker=mark, ls=line, lw=1.6, label=label)
         finish(axis, title, xlabel="network evaluations per chunk (NFE)")
         axis.set(xscale="log", ylim=(0, None))
         axis.set_xticks(*2 * [sorted(frame["nfe"].unique())])
