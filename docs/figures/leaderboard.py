@@ -39,14 +39,18 @@ from lab.statistics import resampled_means
 
 PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
 DOOR = "door, 25"
-Sets = Mapping[str, tuple[str | None, Sequence[str]]]
-"""By name of the demonstrations: the task, or None if its runs have one task, and the runs of their rows."""
+PUSHT = "pusht"
+Sets = Mapping[str, tuple[str, Sequence[str]]]
+"""By name of the demonstrations: the task, and the runs that have its rows."""
 
 HUMAN: Sets = {
-    DOOR: (None, ("door_20000", "door_20000_l1")),
-    "Push-T, 25": (None, ("pusht_25", "pusht_25_l1")),
-    "Push-T, 50": (None, ("pusht_50", "pusht_50_l1")),
-    "Push-T, 206": (None, ("pusht_206_45000", "pusht_206_45000_l1")),
+    name: (task, (run, f"{run}_l1"))
+    for name, task, run in (
+        (DOOR, "adroit-door-human-v0", "door_20000"),
+        ("Push-T, 25", PUSHT, "pusht_25"),
+        ("Push-T, 50", PUSHT, "pusht_50"),
+        ("Push-T, 206", PUSHT, "pusht_206_45000"),
+    )
 }
 SCRIPTED: Sets = {f"{task}, 25": (task, GROUPS[TWENTY_FIVE]) for task in ("square", "can", "stack")}
 TITLES = {
@@ -57,11 +61,8 @@ TITLES = {
 
 def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
     """Return the rows of all sets, by default at the noise of each source's training (MIP's is 0)."""
-    parts = []
-    for name, (task, runs) in sets.items():
-        rows = concat(map(read_played, runs)).assign(set=name)
-        parts.append(rows if task is None else rows[rows["task"] == task])
-    rows = concat(parts)
+    played = {name: concat(map(read_played, runs)) for name, (_, runs) in sets.items()}
+    rows = concat([played[name].query("task == @task").assign(set=name) for name, (task, _) in sets.items()])
     return with_own_noise(rows) if own_noise else rows
 
 
