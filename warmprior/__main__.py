@@ -207,9 +207,9 @@ class Data:
         mask: mask of the file, such as train, whose demonstrations to use; by default all
         demonstrations: number of demonstrations, from the first on; by default all
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
-        style: style of the demonstrations, which decides robosuite's time limit (default: ph, and human
-            outside robosuite)
-        horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
+        style: style of the demonstrations, which decides robosuite's time limit; by default ph, and human
+            outside robosuite
+        horizon: control steps per episode; by default the environment's own, or robosuite's for the style
     """
 
     observation_keys: tuple[str, ...] | None = None

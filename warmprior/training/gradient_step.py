@@ -64,7 +64,7 @@ class GradientStep:
         if world_size() > 1:
             self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
         self._device = generator.device if generator is not None else torch.device("cpu")
-        # Without the cache, which could return weights that were cast without gradients.
+        # Without the cache, which would return the weights that a coupling has cast without gradients.
         self._precision = partial(
             torch.autocast,
             self._device.type,
