@@ -5,8 +5,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import torch
+
 from tests.errors import raises
-from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.files import check_writable, exclusive, read_json, read_tensors, save_file, write_atomic
 
 FORK = multiprocessing.get_context("fork")
 
@@ -52,6 +54,15 @@ def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
     write_atomic(other, lambda temporary: temporary.write_text("whole"))
     assert sorted(tmp_path.iterdir()) == [path, other]
+
+
+def test_tensors_are_written_as_any_other_file(tmp_path):
+    plain, tensors = tmp_path / "plain", tmp_path / "tensors"
+    plain.touch()
+    save_file({"a": torch.arange(3)}, tensors, {"told": "yes"})
+    assert tensors.stat().st_mode == plain.stat().st_mode
+    found, told = read_tensors(tensors.read_bytes())
+    assert found["a"].tolist() == [0, 1, 2] and told == {"told": "yes"}
 
 
 def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):

@@ -25,8 +25,7 @@ JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
     """Write a safetensors file; tensors that share memory, such as tied weights, are written once each."""
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file as save
+    from safetensors.torch import save
 
     own: dict[str, Tensor] = {}
     written: set[int] = set()
@@ -34,10 +33,8 @@ def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] |
         memory = value.untyped_storage().data_ptr()
         own[name] = value.clone() if memory in written else value.contiguous()
         written.add(memory)
-    try:
-        save(own, path, metadata)
-    except SafetensorError as error:
-        raise OSError(str(error)) from error
+    # The format's own writer leaves a temporary file if the process is killed, and hides it from other users.
+    path.write_bytes(save(own, metadata))
 
 
 def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
