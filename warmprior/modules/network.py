@@ -124,7 +124,9 @@ def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor 
     dtype = precision_of(network)
 
     def cast(value: Tensor) -> Tensor:
-        return value if dtype is None or not value.is_floating_point() else value.to(dtype)
+        # Vectors [B, To, d] may be integers or flags; images stay integers until they are encoded.
+        number = value.is_floating_point() or value.ndim <= 3
+        return value if dtype is None or not number else value.to(dtype)
 
     inputs: Any = observation.apply(cast) if isinstance(observation, TensorDictBase) else cast(observation)
     encode = getattr(network, "encode", None)
