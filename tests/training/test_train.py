@@ -37,6 +37,10 @@ def test_what_is_done_before_makes_no_difference(tmp_path):
     assert not equal(policies[0], train(tmp_path / "other", training=other))
 
 
+def test_a_bound_of_ones_own_replaces_that_of_the_demonstrations():
+    assert train(None, clip=0.5).sampling.clip == 0.5
+
+
 def test_what_does_not_exist_is_refused_with_what_does():
     with raises(ValueError, "style", "'ph'"):
         navigation_task("ph")

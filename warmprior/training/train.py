@@ -65,8 +65,7 @@ def new_policy(
         velocity,
         prior,
         start=start,
-        **sampling,
-        clip=task.clip,
+        **{"clip": task.clip, **sampling},
         observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
         # A copy, because the policy moves to the device and the environments' normaliser stays on the CPU.
         normalizer=copy.deepcopy(task.normalizer),
