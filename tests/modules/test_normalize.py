@@ -1,3 +1,5 @@
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,6 +10,7 @@ from torchrl.envs.utils import check_env_specs
 from tests.errors import raises
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior.envs import NavigationEnv
 
 
 def data(n=40):
@@ -117,13 +120,39 @@ def test_errors():
         Normalizer.fit(raw, ("state", "action"))
     broken = raw.clone()
     broken["action"][3, 1] = float("nan")
-    with raises(ValueError, "action", "NaN"):
+    with raises(ValueError, "action", "NaN", "3"):
         Normalizer.fit(broken)
+    fitted = Normalizer.fit(raw)
+    narrow = TensorDict({"observation": torch.rand(5, 1), "action": torch.rand(5, 1)}, [5])
+    for key, wide in (("observation", 4), ("action", 2)):
+        for convert in (fitted.normalize, fitted.denormalize):  # one number would be broadcast
+            with raises(ValueError, key, "[5, 1]", f"[{wide}]"):
+                convert(narrow.select(key))
+    with raises(ValueError, "observation", "[9]", "[4]"):
+        TransformedEnv(NavigationEnv(), fitted.env_transforms()[0]).observation_spec  # noqa: B018
     one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
     with raises(ValueError, "a", "[2]", "[3]"):
         Normalizer(one, two)
     with raises(ValueError, "['a']", "['b']"):
         Normalizer(one, {"b": torch.zeros(2)})
+
+
+def test_tiny_actions_are_told_of():
+    raw = data()
+    raw["action"][:, 1] = 1e-6 * torch.linspace(-1, 1, 40)
+    with pytest.warns(UserWarning, match=r"\[1\].*constant"):
+        Normalizer.fit(raw)
+    raw["action"][:, 1] = 1000 + 1e-4 * torch.linspace(-1, 1, 40)  # rounding noise
+    with warnings.catch_warnings(action="error"):
+        Normalizer.fit(raw)
+
+
+def test_the_whole_range_of_floats_and_any_key():
+    most = torch.finfo(torch.float32).max
+    raw = TensorDict({"observation.state": torch.tensor([[-most], [0.0], [most]])}, [3])
+    normalizer = Normalizer.fit(raw, ("observation.state",))
+    assert normalizer.normalize(raw)["observation.state"].flatten().tolist() == [-1.0, 0.0, 1.0]
+    assert Normalizer.from_config(normalizer.config()).state_dict().keys() == normalizer.state_dict().keys()
 
 
 def test_units_of_their_own():

@@ -13,6 +13,7 @@ from warmprior import (
     PastPrior,
     PoseTrend,
     PreconditionedNetwork,
+    RestingJoints,
     RestingPose,
     SourceMoments,
     VelocityMLP,
@@ -131,6 +132,18 @@ def test_preconditioning_leaves_the_remainder(prior):
             best = columns[kept] @ np.linalg.lstsq(columns[kept], goal[kept], rcond=None)[0]
             mine = np.square(velocity[kept, 0, dim] - goal[kept]).mean()
             assert mine <= 1.02 * np.square(best - goal[kept]).mean()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_cast_trend_keeps_its_units(dtype):
+    """The joints are far from zero, where half precision would lose their differences."""
+    joints = TensorDict(
+        {"observation": 1e5 + 50 * torch.randn(40, 2), "action": 1e5 + 50 * torch.randn(40, 2)}, [40]
+    )
+    rest = RestingJoints([0, 1], units := Normalizer.fit(joints))
+    normalised = units.normalize(joints)["observation"]
+    expected = rest(normalised)
+    torch.testing.assert_close(rest.to(dtype)(normalised.to(dtype)).float(), expected, atol=0.02, rtol=0)
 
 
 def test_config_and_state_bring_it_back():

@@ -53,6 +53,28 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     assert scaled.identity != task.identity
 
 
+@pytest.mark.parametrize("precondition", [False, True])
+def test_no_action_leaves_the_range_of_the_demonstrations(precondition):
+    """One dimension never moves, and one is so far from zero that it counts as constant."""
+    moving = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
+    raw = steps(action=torch.cat((moving, torch.full((40, 1), 0.7), 400_000 + 6 * moving), 1))
+    task = Task.of("arm", raw, CountingEnv)
+    network = NetworkOptions(hidden_dim=8, precondition=precondition)
+    policy = new_policy(task, GaussianPrior(4), network, TrainingConfig(iterations=1))
+    observation = torch.randn(64, 2, 3, generator=torch.Generator().manual_seed(1))
+    data = TensorDict({"observation": observation, "history": cold_history([64], 4, 4, 3)}, [64])
+    for parameter in policy.network.parameters():
+        torch.nn.init.normal_(parameter, std=3.0)  # an untrained network, which predicts anything
+    chunk = policy(data)["vla_action", "chunk"]
+    actions = task.normalizer.denormalize(TensorDict({"action": chunk}, [64, 4]))["action"]
+    low, high = (
+        end + torch.tensor([0.0, 0.0, 0.1]) * sign
+        for end, sign in ((raw["action"].amin(0), -1), (raw["action"].amax(0), 1))
+    )
+    assert (actions >= low - 1e-6).all() and (actions <= high + 1e-6).all()
+    assert actions[..., 2].amax() - actions[..., 2].amin() > 5  # the whole range is reached
+
+
 def test_a_function_of_ones_own_is_found_by_its_place(monkeypatch):
     place = ModuleType("a_users_module")
     place.task = lambda options: Task.of("own", steps()[: options.count("ph")], CountingEnv)

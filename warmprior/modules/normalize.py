@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -13,7 +14,11 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
-from warmprior.checks import check_keys, check_shape
+from warmprior.checks import check_finite_steps, check_keys, check_shape
+from warmprior.keys import ACTION
+
+LEAST = 1e-5
+"""Half the range up to which a dimension counts as constant, in its unit, or as a share of its middle."""
 
 
 class FloatNorm(ObservationNorm):
@@ -26,13 +31,55 @@ class FloatNorm(ObservationNorm):
         """Set the spec of what is normalised, which has the precision of the statistics, or a higher one."""
         for key in self.in_keys:
             leaf = observation_spec.get(key)
+            if leaf is not None:
+                check_width(key, leaf.shape, self.loc)
             dtype = self.loc.dtype if leaf is None else torch.promote_types(leaf.dtype, self.loc.dtype)
             if leaf is not None and leaf.dtype != dtype:
                 observation_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)
         return super().transform_observation_spec(observation_spec)
 
 
-class Normalizer(nn.Module):
+def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
+    """Raise ValueError unless values ``[*B, d]`` have the width of their statistics ``[d]``."""
+    if shape[len(shape) - loc.ndim :] != loc.shape:
+        raise ValueError(
+            f"{key!r} has the shape {list(shape)}, but the normaliser was fitted to {list(loc.shape)}: give "
+            "the entries that the demonstrations had"
+        )
+
+
+def warn_of_tiny(half: Tensor, middle: Tensor) -> None:
+    """Warn of actions that count as constant although half their range is more than rounding noise."""
+    tiny = (half < LEAST) & (half > LEAST / 10 * middle.abs())
+    if tiny.any():
+        warnings.warn(
+            f"the actions {tiny.nonzero().flatten().tolist()} vary by less than {2 * LEAST:g} and count as "
+            "constant: if they matter, give them in a smaller unit, such as millimetres",
+            stacklevel=3,
+        )
+
+
+def bound_of(actions: Tensor) -> float | list[float]:
+    """Return a bound of normalised actions ``[N, d_a]``: 1, or one each if a dimension reaches another."""
+    bound = actions.abs().amax(0)
+    bound = torch.where((bound - 1).abs() < 1e-4, 1.0, bound)
+    return 1.0 if bool((bound == 1).all()) else bound.tolist()
+
+
+class RawUnits(nn.Module):
+    """A module whose buffers are in raw units, and never lose precision when a policy is cast."""
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Self:
+        # The precision of a network may be too low for raw units.
+        def moved(value: Tensor) -> Tensor:
+            result = fn(value)
+            wide = torch.promote_types(result.dtype, value.dtype) == result.dtype
+            return result if wide else value.to(result.device)
+
+        return super()._apply(moved, recurse)
+
+
+class Normalizer(RawUnits):
     """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
     A dimension counts as constant, and is only shifted, if half its range is at most ``1e-5 * max(1,
@@ -66,21 +113,12 @@ class Normalizer(nn.Module):
             check_shape(f"high of {key}", high[key], low[key].shape)
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
-            first, last = (value[key].to(torch.get_default_dtype()) for value in (low, high))
-            loc, half = (last + first) / 2, (last - first) / 2
-            constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
+            # Halved first, because the sum of large numbers may be infinite.
+            first, last = (value[key].to(torch.get_default_dtype()) / 2 for value in (low, high))
+            loc, half = last + first, last - first
+            constant = half <= LEAST * loc.abs().clamp_min(1.0)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
-
-    def _apply(self, fn: Any, recurse: bool = True) -> Self:
-        """Move the statistics, and lower their precision never: a network's may be too low for raw units."""
-
-        def moved(value: Tensor) -> Tensor:
-            result = fn(value)
-            wide = torch.promote_types(result.dtype, value.dtype) == result.dtype
-            return result if wide else value.to(result.device)
-
-        return super()._apply(moved, recurse)
 
     @classmethod
     def fit(
@@ -111,13 +149,17 @@ class Normalizer(nn.Module):
                     f"cannot fit a normaliser to {key!r}, with the entries {sorted(data[key].keys())}: name "
                     f'each with keys=, such as ("{key}", "state")'
                 )
+            check_finite_steps(key, data[key])
         low = {key: data[key].amin(0).clone() for key in keys}
         high = {key: data[key].amax(0).clone() for key in keys}
         for key, unit in (units or {}).items():
             middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
             half = torch.where(unit > 0, unit.to(half), half)
             low[key], high[key] = middle - half, middle + half
-        return cls(low, high)
+        fitted = cls(low, high)
+        if ACTION in low:
+            warn_of_tiny((high[ACTION].double() - low[ACTION].double()) / 2, fitted.loc(ACTION))
+        return fitted
 
     @property
     def positive(self) -> list[str]:
@@ -138,6 +180,7 @@ class Normalizer(nn.Module):
         for key in self.keys:
             value, loc = data.get(key, None), self.loc(key)
             if value is not None:
+                check_width(key, value.shape, loc)
                 value = value if value.is_floating_point() else value.to(loc.dtype)
                 data.set(key, (value - loc) / self.scale(key))
         return data
@@ -146,8 +189,9 @@ class Normalizer(nn.Module):
         """Return a shallow copy in which the keys that are present are in raw units again."""
         data = data.clone(False)
         for key in self.keys:
-            if data.get(key, None) is not None:
-                data.set(key, data.get(key) * self.scale(key) + self.loc(key))
+            if (value := data.get(key, None)) is not None:
+                check_width(key, value.shape, self.loc(key))
+                data.set(key, value * self.scale(key) + self.loc(key))
         return data
 
     def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
@@ -178,4 +222,5 @@ class Normalizer(nn.Module):
 
 
 def _name(key: NestedKey, part: str) -> str:
-    return f"{key if isinstance(key, str) else '/'.join(key)}_{part}"
+    name = key if isinstance(key, str) else "/".join(key)
+    return f"{name.replace('.', ':')}_{part}"  # names of buffers have no dots

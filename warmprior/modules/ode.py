@@ -14,7 +14,14 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.checks import check_keys, check_not_negative, check_share, check_whole_numbers, given
+from warmprior.checks import (
+    check_keys,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_whole_numbers,
+    given,
+)
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
 
@@ -209,12 +216,11 @@ class Sampling:
         check_whole_numbers(**given(nfe=self.nfe, max_nfe=self.max_nfe))
         self.evaluations()
         check_grid(self.grid)
-        bounds = self.clip if isinstance(self.clip, Sequence) else (1.0 if self.clip is None else self.clip,)
         if isinstance(self.clip, Sequence):
-            object.__setattr__(self, "clip", tuple(bounds))
-        # A constant dimension is bounded by 0, but not all of them are constant.
-        if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
-            raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {self.clip}")
+            object.__setattr__(self, "clip", tuple(self.clip))
+            check_not_negative(**{f"clip[{i}]": bound for i, bound in enumerate(self.clip)})
+        else:
+            check_positive(**given(clip=self.clip))
         check_not_negative(**given(temperature=self.temperature))
 
     def evaluations(self, nfe: int | None = None) -> int:

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from warmprior import keys
 from warmprior.checks import check_shape
-from warmprior.modules.normalize import Normalizer
+from warmprior.modules.normalize import Normalizer, RawUnits
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import Registered, from_config
 from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
@@ -25,7 +25,7 @@ VARIANCE_FLOOR = 1e-4
 _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
 
 
-class RestingAction(Registered, nn.Module):
+class RestingAction(Registered, RawUnits):
     """The absolute action that asks a robot to stay where the observation says it is.
 
     The subclasses :class:`RestingJoints` and :class:`RestingPose` find the robot's position in the

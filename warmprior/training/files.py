@@ -13,7 +13,7 @@ from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 from warmprior.keys import ACTION, OBSERVATION, STATE
-from warmprior.modules.normalize import Normalizer
+from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.trend import RestingPose
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
@@ -70,8 +70,7 @@ def recorded_task(
         "normalizer": normalizer,
         "adapters": adapters,
         "rest": None if absolute is None else RestingPose(dataset.pose_columns, normalizer),
-        # Actions outside the range of the demonstrations are executed, and remembered, at its bound.
-        "clip": 1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
+        "clip": bound_of(data[ACTION]),
         "environment": description,
     }
 

@@ -19,7 +19,7 @@ from warmprior.checks import check_choice, check_keys, check_whole_numbers
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.normalize import Normalizer
+from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
@@ -143,17 +143,18 @@ class Task:
                 f"{episode.dtype} {tuple(episode.shape)}"
             )
         normalizer = Normalizer.fit(data, (vector, ACTION))
+        data = normalizer.normalize(data.select(OBSERVATION, ACTION, EPISODE))
         return cls(
             name,
             style,
-            normalizer.normalize(data.select(OBSERVATION, ACTION, EPISODE)),
+            data,
             make_env or _no_environment,
             normalizer,
             success=success,
             measures=measures or {},
             video_rate=video_rate,
             facts={"demonstrations": len(data[EPISODE].unique()), "steps": len(data)},
-            clip=1.0,
+            clip=bound_of(data[ACTION]),
         )
 
     @classmethod
