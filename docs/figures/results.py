@@ -155,7 +155,7 @@ def paper_table() -> str:
 
     names = GAUSSIAN, PAST, PREVIEW
     text = ["| | | Gaussian source | WP-Past | WP-Preview |", "|---|---|---|---|---|"]
-    rows = read_cells(SHORT + LONG)
+    rows = read_cells((*SHORT, *LONG, "square_ph_80000"))
     for (task, style, observations), paper in PAPER_SUCCESS.items():
         ours = rows[(rows["task"] == task) & (rows["data"] == style)]
         if observations == STATE and len(ours):

@@ -131,6 +131,7 @@ def sentences() -> dict[str, list[str]]:
     squared = {n: whole(board.loc[GAUSSIAN, n]["mean"]) for n in (9, 1)}
     gained = {n: "{won} : {lost}".format(**pairs().loc[f"{GAUSSIAN},l1", n]) for n in (9, 1)}
     beside_one_loss = pairs(baseline=f"{GAUSSIAN},l1").loc[f"{CORRELATED},l1", 9]
+    past_one_loss = whole(board.loc[f"{PAST},l1", 9]["mean"])
     return {
         "../README.md": [
             f"the Gaussian source solves {one_loss[GAUSSIAN][9]}% and WP-Past with correlated noise "
@@ -169,7 +170,8 @@ def sentences() -> dict[str, list[str]]:
             f"from {squared[1]} to {one_loss[GAUSSIAN][1]}% at one step "
             f"({gained[1]}) and to {one_loss[GAUSSIAN][9]} at nine ({gained[9]})",
             f"correlated noise solves {one_loss[CORRELATED][9]}% at nine "
-            f"({beside_one_loss['won']} : {beside_one_loss['lost']} against",
+            f"({beside_one_loss['won']} : {beside_one_loss['lost']} against the Gaussian source), "
+            f"and WP-Past {past_one_loss}",
             f"ahead of the Gaussian source at nine steps ({mip_pair['won']} : {mip_pair['lost']}), "
             f"and of WP-Past within chance ({mip_beside_past['won']} : {mip_beside_past['lost']})",
             f"ahead of the Gaussian source ({past_once['won']} : {past_once['lost']}, two-sided",

@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat, read_json
 
+from lab.methods import METHODS
+
 INK = "#767676"  # text and lines, which a white and a black page show equally well
 matplotlib.rcParams |= {"savefig.transparent": True, "grid.color": INK, "grid.alpha": 0.3}
 matplotlib.rcParams |= {
@@ -29,11 +31,13 @@ SOURCES = {  # label, colour and marker in charts
     PREVIEW: ("WP-Preview", "#d95f02", "o"),
     CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
     f"{GAUSSIAN},l1": ("Gaussian source, L1 loss", "#7f7f7f", "v"),
+    f"{PAST},l1": ("WP-Past, L1 loss", "#1f77b4", "v"),
     f"{CORRELATED},l1": ("WP-Past, correlated noise, L1 loss", "#1b9e77", "v"),
     "mip": ("MIP", "#a6761d", "s"),
     "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
     "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
 }
+SOURCES |= {name: (each.label, each.color, "o") for name, each in METHODS.items() if name not in SOURCES}
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 
 

@@ -7,7 +7,7 @@ from torch import nn
 
 from tests.errors import raises
 from warmprior import AdaLNTransformer, ChiTransformer, PlainMLP, VelocityMLP, VelocityNetwork
-from warmprior.modules.network import TimestepEmbedding
+from warmprior.modules.network import TimestepEmbedding, velocity_field
 from warmprior.modules.registry import from_config
 
 
@@ -87,3 +87,11 @@ def test_timestep_embedding_closed_form(dim, last):
         rows.append([math.sin(x) for x in angles] + [math.cos(x) for x in angles])
     found = TimestepEmbedding(dim, **last)(torch.tensor(times))
     torch.testing.assert_close(found, torch.tensor(rows), atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool])
+def test_vectors_of_whole_numbers_are_read_as_floats(dtype):
+    network, observation = VelocityMLP(2, 3, 4, hidden_dim=8), torch.randint(2, (5, 2, 3)).to(dtype)
+    t, a = torch.rand(5), torch.randn(5, 4, 2)
+    expected = velocity_field(network, observation.float())(t, a)
+    assert torch.equal(velocity_field(network, observation)(t, a), expected)
