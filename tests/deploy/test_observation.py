@@ -8,8 +8,18 @@ from tensordict import TensorDict
 from tests.deploy.test_executor import OBSERVATION_DIM, Scripted, actor
 from tests.errors import raises
 from tests.toy_env import ACTION_DIM, stirred
-from warmprior import ImageEncoder, Normalizer, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior import (
+    HistoryObservation,
+    ImageEncoder,
+    Normalizer,
+    PastPrior,
+    VelocityMLP,
+    VisionNetwork,
+    WarmPriorActor,
+    keys,
+)
 from warmprior.deploy import AsyncExecutor
+from warmprior.deploy.observation import observation_shapes
 
 CAMERAS = ("front_image", "wrist_image")
 
@@ -122,6 +132,27 @@ def test_a_normaliser_without_the_observation_and_whole_numbers():
     with AsyncExecutor(policy, latency=0) as executor:
         executor.act({"state": np.array([1, 0, 1]), **pictures(16, 16)})
     assert found[0]["state"].tolist() == [[1.0, 0.0, 1.0]] * 2
+
+
+@pytest.mark.parametrize("width", [3, 0])
+def test_a_policy_of_images_that_sees_the_history_asks_for_what_a_driver_gives(width):
+    """A state of width 0 is that of a policy of images alone."""
+    prior = PastPrior(6)
+    added = HistoryObservation.width(prior.history_length, ACTION_DIM)
+    encoder = ImageEncoder(CAMERAS, width + added, image_size=16, crop_size=12, backbone="small")
+    network = VisionNetwork(encoder, VelocityMLP(ACTION_DIM, encoder.observation_dim, 6, hidden_dim=16))
+    policy = WarmPriorActor(network, prior, observation_key=keys.CONDITIONED)
+    assert observation_shapes(policy) == {"state": (width,), **dict.fromkeys(CAMERAS, (3, 16, 16))}
+    observation = pictures(16, 16) | ({"state": np.zeros(width)} if width else {})
+    with AsyncExecutor(policy, latency=1) as executor:
+        assert executor.act(observation).shape == (ACTION_DIM,)
+
+
+def test_an_entry_that_is_none_is_not_said_to_be_there():
+    with AsyncExecutor(sighted(), latency=0) as executor, raises(KeyError, "there are ['front_image']"):
+        executor.act({"state": None, "front_image": pictures(16, 16)["front_image"]})
+    with AsyncExecutor(actor(PastPrior(6)), latency=0) as executor, raises(KeyError, "state", "there are []"):
+        executor.act(None)
 
 
 def test_drivers_reuse_their_memory():

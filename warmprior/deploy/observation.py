@@ -35,13 +35,14 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
     if (shapes := getattr(plain, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
         return shapes
     encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
-    if encoder is not None or network.encodes:  # a user's own encoder may have no shapes
-        return None if encoder is None else encoder.shapes
-    width = network.observation_dim
-    if keys.CONDITIONED in actor.in_keys:
+    if encoder is None and network.encodes:  # a user's own encoder may have no shapes
+        return None
+    shapes = {keys.STATE: (network.observation_dim,)} if encoder is None else encoder.shapes
+    if keys.CONDITIONED in actor.in_keys and keys.STATE in shapes:
         prior = plain.prior if prior is None else prior
-        width -= HistoryObservation.width(prior.history_length, network.action_dim)
-    return {keys.STATE: (width,)}
+        added = HistoryObservation.width(prior.history_length, network.action_dim)
+        shapes[keys.STATE] = (shapes[keys.STATE][0] - added,)
+    return shapes
 
 
 class RobotObservation:
@@ -93,10 +94,11 @@ class RobotObservation:
                     f"{list(self.shapes)}"
                 )
             observation = dict.fromkeys(self.shapes, observation)
-        check_keys(
-            observation, self.shapes, "the policy", f"; there are {sorted(map(str, observation.keys()))}"
-        )
-        entries = {name: _fitted(name, observation[name], shape) for name, shape in self.shapes.items()}
+        given = {name: value for name, value in observation.items() if value is not None}
+        # An empty vector, of a policy of images that sees the history, is not asked of the driver.
+        given |= {name: () for name, shape in self.shapes.items() if not shape[0]}
+        check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
+        entries = {name: _fitted(name, given[name], shape) for name, shape in self.shapes.items()}
         return next(iter(entries.values())) if self._vector else TensorDict(entries)
 
 
