@@ -308,7 +308,7 @@ def test_chunks_that_no_robot_should_get():
     ("options", "facts"),
     [
         *(({"execute": 6, "delay": 3}, (8, 6, 3, 5)), ({"latency": 5}, (5, 8, 4))),
-        *(({"latency": 1.5}, ("delay", 1.5)), ({"execute": 2.5}, ("execute", 2.5))),
+        *(({"latency": 1.5}, ("latency", 1.5)), ({"execute": 2.5}, ("execute", 2.5))),
         ({"latency": 1, "pool": FakeClock([])}, ("pool",)),
         ({"prior": None}, ("Scripted", "prior", "action_dim")),
         *(
@@ -316,6 +316,8 @@ def test_chunks_that_no_robot_should_get():
             ({"delay": float("nan"), "control_rate": 20}, ("delay",)),
         ),
         ({"delay": 0.06, "control_rate": 0}, ("control_rate", 0)),
+        ({"control_rate": -5}, ("control_rate",)),
+        *(({"latency": "1"}, ("latency",)), ({"execute": "2"}, ("execute",))),
         *(({"delay": float("inf")}, ("delay",)), ({"timeout": "0.1"}, ("timeout",))),
         ({"delay": 1.0, "control_rate": 50}, ("delay", 50)),
     ],

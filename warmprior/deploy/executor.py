@@ -125,13 +125,15 @@ class AsyncExecutor:
         if latency is not None and pool is not None:
             raise ValueError("a simulated latency computes in the calling thread: leave out pool")
         check_whole_numbers(window=window, observation_steps=observation_steps)
+        check_whole_numbers(0, **given(latency=latency))
+        check_whole_numbers(**given(execute=execute))
         check_not_negative(**given(timeout=timeout))
+        check_positive(**given(control_rate=control_rate))
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
         if execute is None:
             execute = min(prior.chunk_length, length - expected)
         check_delay(expected, execute, length)
-        check_whole_numbers(execute=execute)
         check_between(1, prior.chunk_length, execute=execute)
         if normalizer is not None and keys.ACTION not in normalizer.keys:
             raise ValueError(
@@ -341,5 +343,4 @@ def _steps(delay: float | None, control_rate: float | None) -> int:
                 f"delay must be a whole number of control steps, got {delay}: for seconds, give control_rate"
             )
         return int(delay)
-    check_positive(control_rate=control_rate)
     return math.ceil(round(delay * control_rate, 6))
