@@ -36,6 +36,14 @@ def test_a_second_training_in_a_folder_waits_its_turn_and_loses_nothing(tmp_path
     assert files == {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")}
 
 
+def test_a_folder_that_cannot_be_written_is_told_before_the_first_step(tmp_path):
+    (tmp_path / "file").touch()
+    training = make_training(tmp_path / "file" / "run", environment_steps=60)
+    with raises(OSError, tmp_path / "file" / "run", "choose another folder"):
+        training.run()
+    assert training.steps == 0
+
+
 def fill_critic(training):
     with torch.no_grad():
         next(iter(training.agent.loss.qvalue_network_params.values(True, True))).fill_(torch.nan)

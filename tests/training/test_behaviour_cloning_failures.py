@@ -1,6 +1,7 @@
 import dataclasses
 import errno
 import os
+import tempfile
 
 import pytest
 import torch
@@ -48,6 +49,20 @@ def test_a_full_disk(tmp_path, monkeypatch):
     assert again.iteration <= 35
     again.run()
     assert same(weights(again), weights(whole))
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_first_step(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file" / "run", tmp_path / "read-only"):
+        cloning = training(folder)
+        with raises(OSError, folder, "choose another folder"):
+            cloning.run(None)
+        assert cloning.iteration == 0
+        monkeypatch.setattr(tempfile, "TemporaryFile", read_only)  # root may write anywhere
+
+
+def read_only(dir):
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(dir))
 
 
 @pytest.mark.parametrize("bad", [8, 15])

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.checks import check_finite, check_keys
-from warmprior.io.files import exclusive
+from warmprior.io.files import check_writable, exclusive
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
@@ -185,8 +185,10 @@ class PriorSpaceTraining:
                 the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
             BlockingIOError: if another process is training in the folder.
+            OSError: if the folder cannot be written to.
         """
         if self.steps < self.config.environment_steps:
+            check_writable(self.directory)
             with exclusive(self.directory):
                 self._restore()  # another process may have trained since this object was built
                 self._run()

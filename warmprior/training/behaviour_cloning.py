@@ -15,7 +15,7 @@ from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 from warmprior.io.distributed import check_batch, from_leader, rank, world_size
-from warmprior.io.files import exclusive
+from warmprior.io.files import check_writable, exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
@@ -185,9 +185,11 @@ class BehaviourCloning:
         Raises:
             FloatingPointError: if the loss becomes NaN or infinite; the last state and all policies are kept.
             BlockingIOError: if another process is training in the folder.
+            OSError: if the folder cannot be written to.
         """
         if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
             return
+        from_leader(lambda: check_writable(self.directory))
         with exclusive(self.directory) if not self.rank else nullcontext():
             from_leader(lambda: None)  # wait until the first process has locked the folder
             self._restore()  # another process may have trained since this object was built
