@@ -88,3 +88,12 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
         network = load_policy(folder).network
         assert all(torch.isfinite(p).all() for p in network.parameters())
     assert same(weights(finished(tmp_path)), weights(finished(tmp_path / "whole")))
+
+
+def test_nan_before_the_first_save_names_no_state(tmp_path):
+    cloning = training(tmp_path)
+    with torch.no_grad():
+        next(cloning.actor.network.parameters()).fill_(torch.nan)
+    with raises(FloatingPointError, "iteration 7") as stopped:
+        cloning.run(None)
+    assert str(tmp_path) not in str(stopped.value)

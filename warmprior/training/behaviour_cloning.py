@@ -260,9 +260,10 @@ class BehaviourCloning:
         what = "the weights became NaN or infinite"
         if not finite:
             what = f"the loss became {losses[~torch.isfinite(losses)][0].item()}"
+        saved = f"; the last good state is {self.state_path}" if self.state_path.exists() else ""
         raise FloatingPointError(
-            f"{what} at or before iteration {self.iteration}; the last good state is "
-            f"{self.state_path}. Lower the learning rate or check the data."
+            f"{what} at or before iteration {self.iteration}{saved}. Lower the learning rate or check the "
+            "data."
         )
 
     def _log(self, loss: float, bar: Any) -> None:
