@@ -169,6 +169,8 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
         ("", "missing.hdf5"),
         ("--chunk 0", "chunk_length"),
         ("--iterations 0", "iterations"),
+        ("--device gpu", "gpu"),
+        ("--device meta", "meta"),
     ],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, fact):

@@ -93,6 +93,8 @@ def test_what_train_policy_cannot_take():
     ):
         with raises(error, fact):
             train_policy(data, prior)
+    with raises(ValueError, "gpu", "choose another"):
+        train_policy(steps(), PRIOR, device="gpu")
 
 
 def test_train_policy_gives_the_global_generator_back():

@@ -15,7 +15,7 @@ import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase
 
-from warmprior.checks import check_whole_numbers, given
+from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
@@ -256,6 +256,7 @@ def train(
     """
     from warmprior.envs.description import is_registered
 
+    check_device(device)  # before the demonstrations are read
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
     chosen, steps = asdict(data), network.observation_steps
     whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)

@@ -1,4 +1,4 @@
-"""Checks of numbers and tensors."""
+"""Checks of numbers, tensors and devices."""
 
 from __future__ import annotations
 
@@ -66,6 +66,18 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
     """Raise ValueError if a value is none of the choices."""
     if value not in (listed := list(choices)):
         raise ValueError(f"{name} must be one of {', '.join(listed)}, got {value!r}")
+
+
+def check_device(device: torch.device | str) -> None:
+    """Raise ValueError if a device, such as ``"cuda"``, is unknown or does not work."""
+    try:
+        # Compute and read a value: some devices exist only by name, such as meta.
+        torch.ones(1, device=device).add(1).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise ValueError(
+            f"the device {device} does not work here ({reason}): choose another, such as cpu"
+        ) from error
 
 
 def check_shape(name: str, value: Any, expected: Sequence[int | str]) -> None:

@@ -126,7 +126,7 @@ def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
         path = tmp_path / "options.json"
         path.write_text(path.read_text().replace('"device": "cpu"', '"device": "cuda:99"'))
     assert stored_options(Options, tmp_path, "a-study").run.device == "cuda:99"
-    with raises(ValueError, "--device", "cuda:99"):
+    with raises(ValueError, "device cuda:99"):
         read("--resume", out=tmp_path)
 
 

@@ -30,7 +30,7 @@ def no_work(monkeypatch):
     ("script", "words", "facts"),
     [
         ("robomimic", "--nfe 0", ("--nfe", "0")),
-        ("robomimic", "--device cuda:99", ("--device cuda:99",)),
+        ("robomimic", "--device cuda:99", ("device cuda:99",)),
         ("robomimic", f"{FILE} --task can", ("demonstrations of lift", "can")),
         ("robomimic", f"{FILE} --demonstrations 2 3", ("--demonstrations", "--dataset")),
         ("robomimic", "--prior ot --batch-size 1", ("ot", "batch")),
@@ -76,7 +76,7 @@ def no_work(monkeypatch):
         ("prior_space_rl", "--preset unit --horizon 3", ("toy", "--horizon")),
         ("robomimic", "--no-precondition --prior mip", ("mip", "preconditioning")),
         ("gpu", "--part 7", ("--part", "0, 1, 2, 3, 4, 5", "'7'")),
-        ("gpu", "--device cuda:99", ("--device cuda:99",)),
+        ("gpu", "--device cuda:99", ("device cuda:99",)),
         ("gpu", "--preset none", ("--preset", "quick, cpu, paper")),
     ],
 )

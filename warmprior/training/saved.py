@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from warmprior.checks import check_device
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import StartPoint, WarmPriorActor
@@ -284,7 +285,8 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if the folder has no policy.
-        ValueError: if the policy is damaged or has another format version, or a folder is given a revision.
+        ValueError: if the policy is damaged or has another format version, a folder is given a revision, or
+            the device does not work.
         OSError: if the hub does not have the policy, or this user has no access to it.
 
     Examples:
@@ -296,6 +298,7 @@ def load_policy(
         ...     load_policy(folder).prior.chunk_length
         4
     """
+    check_device(device)
     folder = _folder(directory, revision=revision, token=token)
     tensors, config = _read(folder)
     try:

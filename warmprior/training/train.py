@@ -15,6 +15,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
+from warmprior.checks import check_device
 from warmprior.io.distributed import from_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
@@ -134,7 +135,7 @@ def train_policy(
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
         ValueError: if the demonstrations have the wrong form, the folder belongs to a different training
-            run, or the network cannot be compiled.
+            run, the device does not work, or the network cannot be compiled.
 
     Examples:
         >>> import torch
@@ -153,6 +154,7 @@ def train_policy(
     network, training = network or NetworkOptions(), training or TrainingConfig()
     if not isinstance(prior, Prior):
         raise TypeError(f"the prior must be an object such as PastPrior(8), got {prior!r}")
+    check_device(device)  # before the demonstrations are read
     place = isinstance(demonstrations, str | Path)
     if not place and (observation_keys is not None or image_keys):
         raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
