@@ -222,7 +222,7 @@ class Method:
         try:
             if unknown := typed_options.keys() - defaults.keys():
                 raise ValueError(f"{', '.join(sorted(unknown))} is unknown to it, or without effect")
-            self.prior(), self.start()
+            self.prior().config(), self.start()
             if self.pairs_in_batch:
                 self.coupling()
         except (TypeError, ValueError, ArithmeticError) as error:

@@ -56,6 +56,7 @@ def test_what_cannot_be_is_named():
         *((("gaussian,sigma=0.3", H), "sigma"), (("past,sigma=0.3", H, 0.5), "sigma")),
         (("bridge,sigma=1", H), "sigma", "noise"),
         (("warmprior:PastPrior", H), "warmprior:PastPrior"),
+        (("tests.modules.test_user_prior:Forgetful,gain=0.5", H), "Forgetful", "'gain'"),
     ):
         with raises(ValueError, *facts):
             Method(*arguments)

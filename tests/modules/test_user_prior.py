@@ -155,6 +155,19 @@ def test_options_that_do_not_fit():
             make(Prior, text, H)
 
 
+class Forgetful(PastPrior):
+    name = "forgetful-of-the-tests"
+
+    def __init__(self, chunk_length, *, gain=1.0):
+        super().__init__(chunk_length)
+        self.g = gain
+
+
+def test_a_prior_that_cannot_be_saved_is_a_mistake_on_a_command_line():
+    with raises(ValueError, "Forgetful", "'gain'"):
+        make(Prior, f"{__name__}:Forgetful,gain=0.5", H)
+
+
 def test_options_behind_a_name():
     prior = make(Prior, "past,sigma=0.3,correlation=0.2", H)
     assert (prior.sigma, prior.correlation) == (0.3, 0.2)

@@ -35,8 +35,8 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
     """Build an object from a name (:func:`find`) followed by options (:func:`options_of`).
 
     ``args`` are further arguments of the constructor. Raises ValueError, with what is wrong and what the
-    constructor takes. If the text may come from a file, look up its name with :func:`registered`, which
-    imports nothing, and pass the class to :func:`build`.
+    constructor takes, or if the object cannot be saved. If the text may come from a file, look up its name
+    with :func:`registered`, which imports nothing, and pass the class to :func:`build`.
 
     Examples:
         >>> from warmprior.modules.option_text import make
@@ -44,7 +44,12 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
         >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
     """
-    return build(find(base, text.partition(",")[0]), text, *args)
+    made = build(find(base, text.partition(",")[0]), text, *args)
+    try:
+        made.config()
+    except TypeError as error:
+        raise ValueError(str(error)) from error
+    return made
 
 
 def build[T: Registered](cls: type[T], text: str, *args: Any) -> T:
