@@ -162,6 +162,17 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
 
 
+def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):
+    path = tmp_path / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30, 40), task="lift")
+    words = "--times start --iterations 2 --hidden-dim 8 --held-out 1"
+    assert main(["train", str(path), "--out", str(tmp_path / "out"), *words.split()]) == 0
+    said = capsys.readouterr().out
+    assert "NFE 1:" in said and "NFE 3:" not in said and "--nfe 1\n" in said
+    sampling = load_policy(said.splitlines()[-1]).sampling
+    assert sampling.nfe == sampling.max_nfe == 1
+
+
 @pytest.mark.parametrize(
     ("words", "fact"),
     [
@@ -169,6 +180,7 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
         ("", "missing.hdf5"),
         ("--chunk 0", "chunk_length"),
         ("--iterations 0", "iterations"),
+        ("--times start --nfe 3", "nfe=3"),
         ("--device gpu", "gpu"),
         ("--device meta", "meta"),
     ],

@@ -20,7 +20,7 @@ from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.ode import DEFAULT_NFE
+from warmprior.modules.ode import Sampling
 from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
@@ -233,7 +233,7 @@ def train(
     data: Data,
     prior: str = "past,correlation=0.5",
     chunk: int = 8,
-    nfe: int = DEFAULT_NFE,
+    nfe: int | None = None,
     held_out: int | None = None,
     out: Path = Path("policies"),
     device: str = "cpu",
@@ -248,7 +248,7 @@ def train(
         prior: source (gaussian, past, preview, or package.module:Class of your own), with options as in
             past,sigma=0.3
         chunk: chunk length H
-        nfe: network evaluations per chunk, saved with the policy
+        nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
         held_out: number of last demonstrations to leave out for measuring the error of actions; by default
             a tenth if no environment is known, else none
         out: folder of training runs, in which an interrupted one continues
@@ -258,6 +258,7 @@ def train(
 
     check_device(device)  # before the demonstrations are read
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
+    sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
     chosen, steps = asdict(data), network.observation_steps
     whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
     recorded: Any = whole.environment
@@ -278,13 +279,15 @@ def train(
         task,
         source,
         out / name,
-        nfe=nfe,
+        nfe=sampling.evaluations(),
+        max_nfe=sampling.max_nfe,
         network=network,
         training=training,
         device=device,
         description=name,
     )
     saved = policy_path(out / name, training.iterations)
+    nfes = (1, 3, 9) if sampling.max_nfe is None else (1,)
     if left_out is not None:
         spread = float(left_out["action"].var(0, correction=0).mean())
         number = count - task.facts["demonstrations"]
@@ -292,10 +295,10 @@ def train(
             f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
             f"the mean action has {spread:.4f}:"
         )
-        for n, error in errors_of(actor, left_out, steps, (1, 3, 9, nfe)).items():
+        for n, error in errors_of(actor, left_out, steps, (*nfes, sampling.evaluations())).items():
             print(f"  NFE {n}: {error:.4f}")
     if playable:
-        print(f"to play it: python -m warmprior evaluate {saved} --nfe 9 3 1")
+        print(f"to play it: python -m warmprior evaluate {saved} --nfe {' '.join(map(str, nfes[::-1]))}")
     print(saved)
 
 
