@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -39,6 +43,34 @@ def test_what_is_done_before_makes_no_difference(tmp_path):
 
 def test_a_bound_of_ones_own_replaces_that_of_the_demonstrations():
     assert train(None, clip=0.5).sampling.clip == 0.5
+
+
+BARS = """
+import sys
+from pathlib import Path
+from tests.data.synthetic import write_robomimic_file
+from tests.rl.training_parts import make_actor, make_env, make_training
+from tests.training.test_train import CONFIG, NETWORK, PastPrior, navigation_task, train_policy
+from warmprior.data import RobomimicDemonstrations
+from warmprior.training import evaluate
+
+folder = Path(sys.argv[1])
+train_policy(navigation_task(), PastPrior(4), network=NETWORK, training=CONFIG, description="train")
+make_training(folder / "rl", environment_steps=90, collection={"description": "agent"}).run()
+evaluate(make_actor(), make_env(0), episodes=2, first_seed=0, description="play")
+write_robomimic_file(folder / "images.hdf5", lengths=(30,))
+RobomimicDemonstrations(folder / "images.hdf5", image_keys=("agentview_image",))
+"""
+
+
+@pytest.mark.parametrize("disable", ["", "1"])
+def test_the_environment_turns_bars_off(tmp_path, disable):
+    pytest.importorskip("h5py")
+    command = [sys.executable, "-c", BARS, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"TQDM_DISABLE": disable})
+    assert done.returncode == 0, done.stderr
+    shown = [name for name in ("train", "agent", "play", "read images.hdf5") if f"{name}:" in done.stderr]
+    assert len(shown) == (0 if disable else 4), done.stderr
 
 
 def test_what_does_not_exist_is_refused_with_what_does():

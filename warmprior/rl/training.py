@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.checks import check_finite, check_keys
+from warmprior.checks import check_finite, check_keys, given
 from warmprior.io.files import check_writable, exclusive
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
@@ -204,7 +204,7 @@ class PriorSpaceTraining:
                 initial=self.steps,
                 desc=self.description,
                 unit="step",
-                disable=self.description is None,
+                **given(disable=self.description is None or None),  # given, it would overrule TQDM_DISABLE
             ) as bar,
         ):
             self.decoder.check_env(evaluation_env)

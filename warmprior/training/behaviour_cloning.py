@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
+from warmprior.checks import given
 from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import check_writable, exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
@@ -214,7 +215,7 @@ class BehaviourCloning:
             desc=description,
             unit="it",
             dynamic_ncols=True,
-            disable=description is None,
+            **given(disable=description is None or None),  # given, it would overrule TQDM_DISABLE
         )
         self._logged = self.iteration, time.monotonic()
         report = progress or (lambda iteration: None)

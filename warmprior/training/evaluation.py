@@ -18,7 +18,7 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers, given
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of
@@ -242,7 +242,8 @@ def evaluate(
     if len(env.batch_size) > 1:
         raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
     outcomes: list[Episode] = []
-    bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
+    hidden = given(disable=description is None or None)  # given, it would overrule TQDM_DISABLE
+    bar = tqdm(total=episodes, desc=description, unit="ep", **hidden)
 
     def report(outcome: Episode) -> None:
         outcomes.append(outcome)
