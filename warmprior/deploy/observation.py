@@ -37,7 +37,7 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
     encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
     if encoder is None and network.encodes:  # a user's own encoder may have no shapes
         return None
-    shapes = {keys.STATE: (network.observation_dim,)} if encoder is None else encoder.shapes
+    shapes = {keys.STATE: (network.observation_dim,)} if encoder is None else {**encoder.shapes}
     if keys.CONDITIONED in actor.in_keys and keys.STATE in shapes:
         prior = plain.prior if prior is None else prior
         added = HistoryObservation.width(prior.history_length, network.action_dim)
