@@ -86,15 +86,15 @@ def memory_gain(
     windows = windows.reshape(windows.batch_size.numel())
     encoded = encoded_windows(policy, windows)
     flat = flat_windows(policy, encoded)
-    device, n = flat.loc.device, len(flat)
+    loc, device = flat[keys.LOC], flat.device
     # A network that sees the last actions encodes them together with the images.
     plain = (windows if policy.sees_history else encoded).to(device)
     _check_seen(policy, plain)
     generator = torch.Generator(device).manual_seed(0)
-    normal = torch.randn(n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device)
+    normal = torch.randn(len(flat), 1, loc.shape[-1], generator=generator, dtype=loc.dtype, device=device)
     direction = torch.nn.functional.normalize(normal, dim=-1)
     state = generator.get_state()
-    history = flat.history
+    history = flat[keys.HISTORY]
 
     def predicted(shift: float) -> dict[int, Tensor]:
         generator.set_state(state)  # the same noise on both sides
@@ -108,7 +108,7 @@ def memory_gain(
     with evaluation_mode(policy):
         up, down = predicted(shift), predicted(-shift)
     executed = slice(prior.chunk_length)
-    counted = flat.counted[:, executed, 0]
+    counted = flat["counted"][:, executed, 0]
     followed = counted & ((history["steps"] > 0) | (history["forecast_steps"] > 0))
     cold = 0.0 if counted.any() else math.nan
     gains = {}

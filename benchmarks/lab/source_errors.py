@@ -65,7 +65,8 @@ def mean_error(
     with evaluation_mode(policy):
         nfe = policy.sampling.evaluations(nfe)
         chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
-    mean, warm = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
+    mean = flat[keys.LOC]
+    warm = (flat[keys.WARM] & flat["counted"]).expand_as(mean)
     return MeanError(_rms((mean - target)[warm]), _rms((mean - chunk)[warm]))
 
 
@@ -136,14 +137,12 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must be in (0, 1), got {level}")
     flat, prior = flat_windows(policy, windows, target_needed=True), policy.prior
-    assert flat.target is not None
     with evaluation_mode(policy):
-        source = prior.distribution(flat.history, flat.observation)
+        source = prior.distribution(flat[keys.HISTORY], flat[policy.observation_key])
     if type(source) is not Source:
         return math.nan
     z = math.sqrt(2.0) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
-    inside = (flat.target - source.loc).abs() <= z * source.scale
-    executed = slice(prior.chunk_length)
-    return float(
-        inside[:, executed][flat.counted[:, executed].expand_as(inside[:, executed])].double().mean()
-    )
+    inside = (flat[keys.CHUNK] - source.loc).abs() <= z * source.scale
+    inside = inside[:, : prior.chunk_length]
+    counted = flat["counted"][:, : prior.chunk_length].expand_as(inside)
+    return float(inside[counted].double().mean())

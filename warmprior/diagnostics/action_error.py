@@ -48,7 +48,7 @@ def action_error(
     """
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat, target, rows, generator = judged(policy, windows)
-    counted = flat.counted[:, : prior.chunk_length, 0]
+    counted = flat["counted"][:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):
         a0 = drawn(policy, rows, generator)

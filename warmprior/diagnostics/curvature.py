@@ -77,32 +77,31 @@ def branching_cost(
     rows = windows.repeat(draws)
     path = getattr(policy.network, "interpolant", LinearInterpolant())
     generator = policy.sampler.chosen_generator(generator)
-    assert rows.target is not None
     with evaluation_mode(policy):
-        a0 = policy.prior.sample(rows.history, rows.observation, generator)
+        a0 = policy.prior.sample(rows[keys.HISTORY], rows[policy.observation_key], generator)
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
-        a_t, velocity = path(a0, rows.target, t, generator)
+        a_t, velocity = path(a0, rows[keys.CHUNK], t, generator)
         slices = [slice(i, i + SPLIT) for i in range(0, n * draws, SPLIT)]
         predicted = torch.cat(
-            [velocity_field(policy.network, rows.observation[s])(t[s], a_t[s]) for s in slices]
+            [velocity_field(policy.network, rows[policy.observation_key][s])(t[s], a_t[s]) for s in slices]
         )
-    error = (predicted - velocity).square() * rows.counted
-    still = velocity.square() * rows.counted
+    error = (predicted - velocity).square() * rows["counted"]
+    still = velocity.square() * rows["counted"]
 
     def total(x: Tensor) -> Tensor:
-        return x.sum((-1, -2)).view(draws, *windows.shape).mean(0)
+        return x.sum((-1, -2)).view(draws, *batch.batch_size).mean(0)
 
     return TensorDict(
         {
             "cost": total(error),
-            "cost_warm": total(error * rows.warm),
+            "cost_warm": total(error * rows[keys.WARM]),
             "cost_executed": total(error[:, :steps]),
             "still": total(still),
             "still_executed": total(still[:, :steps]),
         },
-        batch_size=windows.shape,
+        batch_size=batch.batch_size,
     )
 
 
@@ -237,10 +236,10 @@ def curvature(
     with evaluation_mode(policy):
         # All sources are drawn at once, so that splitting the batch does not change them.
         generator = policy.sampler.chosen_generator(generator)
-        a0 = policy.prior.sample(rows.history, rows.observation, generator)
+        a0 = policy.prior.sample(rows[keys.HISTORY], rows[policy.observation_key], generator)
         for i in range(0, len(rows), SPLIT):
             s = slice(i, i + SPLIT)
-            parts.append(_measure(policy, a0[s], rows.observation[s], n_steps))
+            parts.append(_measure(policy, a0[s], rows[policy.observation_key][s], n_steps))
     deviations, mean, gap = (torch.cat(part) for part in zip(*parts, strict=True))
     bad = ~torch.isfinite(deviations).flatten(1).all(1)
     if bad.any():
@@ -248,12 +247,12 @@ def curvature(
         raise FloatingPointError(
             f"{int(bad.sum())} of {len(rows)} paths are NaN or infinite: observation {row}"
         )
-    out = TensorDict({}, batch_size=windows.shape, device=a0.device)
+    out = TensorDict({}, batch_size=batch.batch_size, device=a0.device)
     for suffix, end in (("", policy.prior.prediction_length), ("_executed", policy.prior.chunk_length)):
-        counted = rows.counted[:, :end].expand_as(mean[:, :end])
+        counted = rows["counted"][:, :end].expand_as(mean[:, :end])
 
         def total(x: Tensor, counted: Tensor = counted, end: int = end) -> Tensor:
-            return (x[:, :end] * counted).sum((-1, -2)).view(draws, *windows.shape).mean(0)
+            return (x[:, :end] * counted).sum((-1, -2)).view(draws, *batch.batch_size).mean(0)
 
         count = total(torch.ones_like(mean))
         kappa, speed = total(deviations), total(mean.square())
@@ -305,10 +304,10 @@ def flow_paths(
     windows = flat_windows(policy, batch)
     with evaluation_mode(policy):
         generator = policy.sampler.chosen_generator(generator)
-        a0 = policy.prior.sample(windows.history, windows.observation, generator)
-        field = velocity_field(policy.network, windows.observation)
+        a0 = policy.prior.sample(windows[keys.HISTORY], windows[policy.observation_key], generator)
+        field = velocity_field(policy.network, windows[policy.observation_key])
         path = integrate(field, a0, nfe=n_steps, return_path=True)
-    return path.view(*windows.shape, *path.shape[1:])
+    return path.view(*batch.batch_size, *path.shape[1:])
 
 
 def _measure(

@@ -5,11 +5,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -33,33 +31,15 @@ SPLIT = 4096
 """The largest batch of the network, which bounds memory and changes nothing else."""
 
 
-@dataclass
-class Windows:
-    """A batch of windows, flattened to ``N``, on the policy's device.
+def flat_windows(
+    policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False
+) -> TensorDictBase:
+    """Check a batch, and return it flattened to ``[N]``, on the policy's device.
 
-    ``shape`` is the batch's own, ``counted`` tells positions inside the episode, bool ``[N, P, 1]``.
+    It has the policy's inputs, the target if the batch has one, the source's ``keys.LOC`` and ``keys.WARM``,
+    and ``"counted"``, bool ``[N, P, 1]``: True inside the episode. Raises KeyError or ValueError if the batch
+    is invalid.
     """
-
-    shape: torch.Size
-    observation: Tensor
-    history: TensorDictBase
-    loc: Tensor
-    warm: Tensor
-    counted: Tensor
-    target: Tensor | None
-
-    def __len__(self) -> int:
-        return len(self.loc)
-
-    def repeat(self, draws: int) -> Windows:
-        """The windows ``draws`` times in a row, for as many samples of the source each."""
-        parts = (self.observation, self.history, self.loc, self.warm, self.counted, self.target)
-        repeated = [None if p is None else p.repeat(draws, *[1] * (p.ndim - 1)) for p in parts]
-        return Windows(self.shape, *repeated)  # type: ignore[arg-type]
-
-
-def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
-    """Check and flatten a batch; raise KeyError or ValueError if it is invalid."""
     observation_key = policy.observation_key
     needed = [*policy.in_keys, *([keys.CHUNK] if target_needed else [])]
     bare = "" if policy.ode.guidance is None else "; or measure policy.replace(guidance=None)"
@@ -68,32 +48,18 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
     check_usual_keys(policy, "a measure")
     if isinstance(batch.get(observation_key), TensorDictBase):
         raise ValueError(f"{observation_key!r} is not a vector: pass encoded_windows(policy, windows)")
-    device = device_of(policy, batch.get(observation_key))
-    prior, ndim = policy.prior, batch.ndim
-
-    def flat(key: NestedKey) -> Tensor | None:
-        value = batch.get(key, None)
-        return None if value is None else value.reshape(-1, *value.shape[ndim:]).to(device)
-
-    observation, target, pad = map(flat, (observation_key, keys.CHUNK, keys.IS_PAD))
-    assert observation is not None
-    if target is not None:
-        check_positions(keys.CHUNK, target, prior)
-    history = batch.get(keys.HISTORY).reshape(-1).to(device)
-    entries = {
-        observation_key: observation,
-        keys.CHUNK: target,
-        keys.ACTIONS: history["actions"],
-        keys.FORECAST: history["forecast"],
-    }
-    for key, value in entries.items():
-        if value is not None:
+    device, read = device_of(policy, batch.get(observation_key)), (*policy.in_keys, keys.CHUNK, keys.IS_PAD)
+    flat = batch.select(*read, strict=False).reshape(-1).to(device)
+    for key in (observation_key, keys.CHUNK, keys.ACTIONS, keys.FORECAST):
+        if (value := flat.get(key, None)) is not None:
             check_finite_steps(key, value)
+    if keys.CHUNK in flat.keys(True):
+        check_positions(keys.CHUNK, flat[keys.CHUNK], policy.prior)
     with torch.no_grad():
-        source = prior.distribution(history, observation)
-        loc, warm = source.loc, source.warm
-    counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
-    return Windows(batch.batch_size, observation, history, loc, warm, counted, target)
+        source = policy.prior.distribution(flat[keys.HISTORY], flat[observation_key])
+    pad = flat.get(keys.IS_PAD, None)
+    counted = torch.ones_like(source.warm) if pad is None else ~pad.unsqueeze(-1)
+    return flat.update({keys.LOC: source.loc, keys.WARM: source.warm, "counted": counted})
 
 
 def check_not_empty(batch: TensorDictBase) -> None:
@@ -104,19 +70,17 @@ def check_not_empty(batch: TensorDictBase) -> None:
 
 def judged(
     policy: WarmPriorActor, windows: TensorDictBase
-) -> tuple[Windows, Tensor, TensorDictBase, torch.Generator]:
+) -> tuple[TensorDictBase, Tensor, TensorDictBase, torch.Generator]:
     """Return windows, targets, the policy's inputs, and a generator with a fixed seed."""
     flat = flat_windows(policy, windows, target_needed=True)
-    assert flat.target is not None
-    device = flat.loc.device
-    rows = windows.select(*policy.in_keys).reshape(len(flat)).to(device)
-    return flat, flat.target, rows, torch.Generator(device).manual_seed(0)
+    generator = torch.Generator(flat.device).manual_seed(0)
+    return flat, flat[keys.CHUNK], flat.select(*policy.in_keys), generator
 
 
 def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
     """Return True if a policy's chunks depend on the history of windows ``[*B]`` with encoded images."""
     sees = policy.sees_history or policy.start is not None
-    return sees or bool(flat_windows(policy, windows).warm.any())
+    return sees or bool(flat_windows(policy, windows)[keys.WARM].any())
 
 
 def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None) -> Tensor:
@@ -242,8 +206,7 @@ def deployed_history(
 
     ``previous`` are training windows ``[*B]``, ``H`` steps before those of interest in the same episodes.
     """
-    windows = flat_windows(policy, previous)
-    data = previous.select(*policy.in_keys).to(windows.loc.device)
+    data = previous.select(*policy.in_keys).to(flat_windows(policy, previous).device)
     with evaluation_mode(policy):
         data.set(keys.NOISE, drawn(policy, data, generator))
         chunk = policy.integrate(data).get(keys.CHUNK)

@@ -143,14 +143,14 @@ def source_leak(
     check_whole_numbers(2, draws=draws)
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat, target, rows, generator = judged(policy, windows)
-    n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
+    n, device, chunk_length = len(flat), flat.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
     episodes = torch.arange(n) if episodes is None else episodes.flatten()
     check_shape("episodes of the windows", episodes, (n,))
     if len(episodes.unique()) < 2:
         raise ValueError("each window is compared with one from another episode: at least 2 are needed")
-    target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
+    target, counted = target[:, :chunk_length], flat["counted"][:, :chunk_length, 0]
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
     with evaluation_mode(policy):
