@@ -85,9 +85,6 @@ class ImageEncoder(nn.Module):
         (torch.Size([4, 2, 73]), 73)
     """
 
-    _mean: Tensor
-    _deviation: Tensor
-
     def __init__(
         self,
         cameras: Sequence[str],
@@ -115,8 +112,8 @@ class ImageEncoder(nn.Module):
         self.networks = nn.ModuleList(network for network, _ in made)
         #: Width of what :meth:`forward` returns.
         self.observation_dim = state_dim + len(cameras) * made[0][1]
-        for name, values in {"_mean": _CHANNEL_MEAN, "_deviation": _CHANNEL_DEVIATION}.items():
-            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
+        statistics = torch.tensor([_CHANNEL_MEAN, _CHANNEL_DEVIATION]).view(2, 3, 1, 1)
+        self._mean, self._deviation = (nn.Buffer(values, persistent=False) for values in statistics)
 
     def config(self) -> dict[str, Any]:
         """Return the constructor arguments as JSON holds them."""

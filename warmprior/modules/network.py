@@ -165,14 +165,12 @@ class TimestepEmbedding(nn.Module):
     < 4, or if ``last`` is not > 0.
     """
 
-    frequencies: Tensor
-
     def __init__(self, dim: int, last: float = 100.0) -> None:
         super().__init__()
         check_positive(time_frequency=last)
         if dim < 4 or dim % 2:
             raise ValueError(f"the timestep embedding must be even and >= 4, got {dim}")
-        self.register_buffer("frequencies", torch.logspace(0, math.log10(last), dim // 2), persistent=False)
+        self.frequencies = nn.Buffer(torch.logspace(0, math.log10(last), dim // 2), persistent=False)
 
     def forward(self, t: Tensor) -> Tensor:
         """Embed the times."""

@@ -52,12 +52,6 @@ class SourceMoments(nn.Module):
         [True, True, True, True, False, False, False, False]
     """
 
-    source_mean: Tensor
-    target_mean: Tensor
-    source_variance: Tensor
-    target_variance: Tensor
-    covariance: Tensor
-    conditional_deviation: Tensor
     positive = ("source_variance", "target_variance", "conditional_deviation")
 
     def __init__(
@@ -78,17 +72,16 @@ class SourceMoments(nn.Module):
         v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance))
         limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
         c = covariance.double().clamp(-limit, limit)
-        for name, value in {
-            "source_mean": source_mean,
-            "target_mean": target_mean,
-            "source_variance": v0,
-            "target_variance": v1,
-            "covariance": c,
-            # The target's deviation given the source, in float64: lower precisions would lose the difference.
-            "conditional_deviation": (v1 - c.square() / v0).sqrt(),
-        }.items():
-            # Copies, so that a tensor given twice does not become one buffer under two names.
-            self.register_buffer(name, value.to(source_mean.dtype, copy=True))
+        # The target's deviation given the source, in float64: lower precisions would lose the difference.
+        q = (v1 - c.square() / v0).sqrt()
+
+        def kept(value: Tensor) -> nn.Buffer:
+            # A copy, so that a tensor given twice does not become one buffer under two names.
+            return nn.Buffer(value.to(source_mean.dtype, copy=True))
+
+        self.source_mean, self.target_mean = kept(source_mean), kept(target_mean)
+        self.source_variance, self.target_variance = kept(v0), kept(v1)
+        self.covariance, self.conditional_deviation = kept(c), kept(q)
 
     def config(self) -> None:
         """Return nothing: the values are buffers, and replace those of :meth:`identity`."""

@@ -56,8 +56,6 @@ class ChiTransformer(VelocityNetwork):
         torch.Size([4, 8, 7])
     """
 
-    causal_mask: Tensor
-
     def __init__(
         self,
         action_dim: int,
@@ -110,7 +108,7 @@ class ChiTransformer(VelocityNetwork):
         self.decoder = nn.TransformerDecoder(layer, num_layers)
         self.head = nn.Sequential(nn.LayerNorm(embedding_dim), nn.Linear(embedding_dim, action_dim))
         mask = nn.Transformer.generate_square_subsequent_mask(prediction_length)
-        self.register_buffer("causal_mask", mask, persistent=False)
+        self.causal_mask = nn.Buffer(mask, persistent=False)
         self.apply(self._init_weights)
         nn.init.normal_(self.action_position, std=0.02)
         nn.init.normal_(self.memory_position, std=0.02)

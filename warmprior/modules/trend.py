@@ -45,11 +45,6 @@ class RestingAction(Registered, RawUnits):
         [True, True]
     """
 
-    columns: Tensor
-    loc: Tensor
-    scale: Tensor
-    action_loc: Tensor
-    action_scale: Tensor
     positive = ("scale", "action_scale")
 
     def __init__(self, columns: Tensor, action_shape: tuple[int, ...], normalizer: Normalizer | None) -> None:
@@ -62,9 +57,8 @@ class RestingAction(Registered, RawUnits):
             vector = next(key for key in normalizer.keys if key != keys.ACTION)
             affine = [end(vector)[columns] for end in ends]
             affine += [end(keys.ACTION).reshape(action_shape) for end in ends]
-        self.register_buffer("columns", columns)
-        for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
-            self.register_buffer(name, value.clone())
+        self.columns = nn.Buffer(columns)
+        self.loc, self.scale, self.action_loc, self.action_scale = (nn.Buffer(v.clone()) for v in affine)
 
     @property
     def width(self) -> int:
@@ -169,10 +163,6 @@ class PoseTrend(nn.Module):
         (tensor(0.), tensor([0.1000, 0.2000, 0.3000]))
     """
 
-    centre: Tensor
-    source: Tensor
-    target: Tensor
-
     def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
         super().__init__()
         self.rest = rest
@@ -181,7 +171,7 @@ class PoseTrend(nn.Module):
             check_shape(f"the trend's {name}", value, shape)
             if not torch.isfinite(value).all():
                 raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")
-            self.register_buffer(name, value.clone())
+        self.centre, self.source, self.target = (nn.Buffer(v.clone()) for v in (centre, source, target))
 
     @classmethod
     def zero(cls, rest: dict[str, Any], prediction_length: int) -> PoseTrend:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
@@ -134,8 +134,7 @@ class WarmUpSwitch(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, [keys.DELTA, keys.CHUNK]
         self.warmup, self.policy = warmup, policy
-        self.learning: torch.Tensor
-        self.register_buffer("learning", torch.zeros((), dtype=torch.bool))
+        self.learning = nn.Buffer(torch.zeros((), dtype=torch.bool))
 
     def forward(self, data: TensorDictBase) -> TensorDictBase:
         """Write a residual and its chunk."""

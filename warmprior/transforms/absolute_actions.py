@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
 from warmprior import keys
@@ -64,8 +64,7 @@ class AbsoluteActions(EnvTransform):
         rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
         check_shape("output_max of AbsoluteActions", scale, (6,))
         check_shape("base_rotation of AbsoluteActions", rotation, ("arms", 3, 3))
-        self.register_buffer("scale", scale)
-        self.register_buffer("base_rotation", rotation.double())
+        self.scale, self.base_rotation = nn.Buffer(scale), nn.Buffer(rotation.double())
 
     @property
     def arms(self) -> int:

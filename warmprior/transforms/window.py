@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
@@ -60,11 +60,6 @@ class ActionWindow(Transform):
         [[0.0, 0.0], [0.0, 1.0], [2.0, 3.0]]
     """
 
-    start: Tensor
-    end: Tensor
-    action_offsets: Tensor
-    observation_offsets: Tensor
-
     def __init__(
         self,
         data: TensorDictBase,
@@ -86,16 +81,15 @@ class ActionWindow(Transform):
         self.chunk_length, self.history_length = chunk_length, history_length
         observations, action, episode = _checked(data, observation_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
-        start, end = _episode_borders(episode)
-        for name, value in {
-            **dict(zip(self._observations, observations.values(), strict=True)),
-            "action": action,
-            "start": start,
-            "end": end,
-            "action_offsets": torch.arange(-history_length, prediction_length, device=start.device),
-            "observation_offsets": torch.arange(1 - observation_steps, 1, device=start.device),
-        }.items():
+        stored = dict(zip(self._observations, observations.values(), strict=True))
+        for name, value in (stored | {"action": action}).items():
             self.register_buffer(name, value, persistent=False)
+        start, end = _episode_borders(episode)
+        offsets = torch.arange(-history_length, prediction_length, device=start.device)
+        recent = torch.arange(1 - observation_steps, 1, device=start.device)
+        self.start, self.end, self.action_offsets, self.observation_offsets = (
+            nn.Buffer(value, persistent=False) for value in (start, end, offsets, recent)
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the windows of the sampled steps."""
