@@ -270,17 +270,11 @@ class ControlLoop(StepLoop):
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
-        for robot in env.robots:
-            if not is_plain_arm(robot):
-                composite = robot.composite_controller
-                what = f"{type(composite).__name__} with {sorted(composite.part_controllers)}"
-                raise ValueError(
-                    f"the lean loop needs plain OSC_POSE arms: use control_loop='robosuite' for {what}"
-                )
         if not is_plain(env):
+            controllers = [type(robot.composite_controller).__name__ for robot in env.robots]
             raise ValueError(
-                f"the lean loop would bypass a step or sensors that {type(env).__name__} has of its own: use "
-                "control_loop='robosuite'"
+                "the lean loop needs plain OSC_POSE arms, and robosuite's own step and sensors: use "
+                f"control_loop='robosuite' for {type(env).__name__} with {controllers}"
             )
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
