@@ -426,6 +426,16 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             data = _allocate(index, action_dim, storage, scratch_dir)
             _fill(index, data, reader, _actions(index, reader, conventions, as_recorded))
         self._index = index
+        #: The file or folder that was read.
+        self.path = index.path
+        #: The recorded task of :data:`warmprior.envs.TASKS`, or ``None`` if it is not among them.
+        self.task = index.task
+        #: The keys whose values are concatenated in the observation's vector.
+        self.observation_keys = index.observation_keys
+        #: The side of the images in pixels, 0 if there are none.
+        self.image_size = index.image_size
+        #: The number of demos read.
+        self.num_episodes = len(index.demos)
         super().__init__(
             storage=TensorStorage(data if storage == "memmap" else data.to(device)),
             writer=ImmutableDatasetWriter(),
@@ -444,11 +454,6 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         return self._storage.get(slice(None))
 
     @property
-    def path(self) -> Path:
-        """The file or folder that was read."""
-        return self._index.path
-
-    @property
     def env_args(self) -> dict[str, Any]:
         """A copy of the description of the recorded environment, for robosuite 1.5.
 
@@ -458,21 +463,6 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         if not self._index.env_args:
             raise ValueError(f"{self.path} does not say which environment it was recorded in")
         return modernize_env_args(self._index.env_args)
-
-    @property
-    def task(self) -> TaskSpec | None:
-        """The recorded task of :data:`warmprior.envs.TASKS`, or ``None`` if it is not among them."""
-        return self._index.task
-
-    @property
-    def observation_keys(self) -> tuple[str, ...]:
-        """The keys whose values are concatenated in the observation's vector."""
-        return self._index.observation_keys
-
-    @property
-    def image_size(self) -> int:
-        """The side of the images in pixels, 0 if there are none."""
-        return self._index.image_size
 
     @property
     def pose_columns(self) -> Tensor:
@@ -490,8 +480,3 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         index, position = self._index, self.observation_keys.index(key)
         first, width = sum(index.observation_dims[:position]), index.observation_dims[position]
         return [first + action if action < width else -1 for action in range(index.action_dim)]
-
-    @property
-    def num_episodes(self) -> int:
-        """The number of demos read."""
-        return len(self._index.demos)

@@ -166,11 +166,6 @@ class RobosuiteEnv(EnvBase):
         """The simulator seed that the next reset uses."""
         return self._seed + self._offset + self._episode * self._stride
 
-    @property
-    def loop(self) -> StepLoop:
-        """The control loop, with access to the simulator's state and the poses of bodies and sites."""
-        return self._loop
-
     def render_frame(
         self,
         camera: str | None = None,
@@ -198,11 +193,12 @@ class RobosuiteEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
     def _make_specs(self, env: Any) -> None:
-        self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
+        #: The control loop, with access to the simulator's state and the poses of bodies and sites.
+        self.loop: StepLoop = _LOOPS[self.control_loop](env, self.low_dim_keys)
         self._renderers = EnvRenderers(env, fast=self.fast_rendering)
         if self.from_pixels:
             require_rendering()
-        width = sum(value.size for value in self._loop.observations().values())
+        width = sum(value.size for value in self.loop.observations().values())
 
         def flag() -> Categorical:
             return Categorical(2, dtype=torch.bool, shape=(1,), device=self.device)
@@ -216,7 +212,7 @@ class RobosuiteEnv(EnvBase):
             nested = {camera: pixels.clone() for camera in self.cameras}
             self.observation_spec["pixels"] = Composite(nested) if self.nested_pixels else pixels
         if self.sim_state:
-            numbers = len(self._loop.state())
+            numbers = len(self.loop.state())
             state = Unbounded((numbers,), dtype=torch.float64, device=self.device)
             self.observation_spec[keys.SIM_STATE] = state
         if self.eef_pose:
@@ -241,10 +237,10 @@ class RobosuiteEnv(EnvBase):
             frames = {camera: self.render_frame(camera) for camera in self.cameras}
             measured["pixels"] = frames if self.nested_pixels else frames[self.cameras[0]]
         if self.sim_state:
-            measured[keys.SIM_STATE] = self._loop.state()
+            measured[keys.SIM_STATE] = self.loop.state()
         if self.eef_pose:
             arms = range(len(self._env.robots))
-            poses = [np.column_stack(self._loop.eef(arm)[::-1]) for arm in arms]
+            poses = [np.column_stack(self.loop.eef(arm)[::-1]) for arm in arms]
             measured[keys.EEF_POSE] = np.stack(poses).astype(np.float32)
         return measured
 
@@ -266,12 +262,12 @@ class RobosuiteEnv(EnvBase):
         return result if self.device is None else result.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        observations = self._loop.reset(self.episode_seed)
+        observations = self.loop.reset(self.episode_seed)
         self._episode += 1
         self._elapsed = 0
         return self._tell((False, False, False, False), observations).exclude("reward")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(keys.ACTION).detach().cpu().double().numpy()
-        observations, success = self._loop.step(action)
+        observations, success = self.loop.step(action)
         return self._tell(self._count(success), observations)

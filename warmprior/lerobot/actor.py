@@ -198,7 +198,7 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
             raise ValueError(f"{type(policy).__name__} has no prior of its own: give LeRobotActor one")
         self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
         self.postprocess = postprocess
-        self.network = self.ode.network
+        self.network, self.sampling = self.ode.network, self.ode.sampling
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *history_keys()]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
@@ -207,11 +207,6 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
     def prior(self) -> Prior:
         """The source distribution."""
         return self.ode.source.prior
-
-    @property
-    def sampling(self) -> Sampling:
-        """The options for drawing a chunk."""
-        return self.ode.sampling
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]] | None:

@@ -39,6 +39,8 @@ class ChunkSource:
         weights = prior.parameters() if isinstance(prior, nn.Module) else ()
         device = next((weight.device for weight in weights), None)
         self._lengths = prior.history_length, prior.prediction_length
+        #: The slice of the prior's ``P`` positions in the chunk.
+        self.positions = slice(self.lead, self.lead + prior.prediction_length)
         try:
             prior.distribution(cold_history([1], *self._lengths, self.action_dim, device=device))
         except Exception as error:
@@ -47,11 +49,6 @@ class ChunkSource:
             check_shape("std", std, (self.action_dim,))
             for value in std.tolist():
                 check_positive(std=value)
-
-    @property
-    def positions(self) -> slice:
-        """The slice of the prior's ``P`` positions in the chunk."""
-        return slice(self.lead, self.lead + self.prior.prediction_length)
 
     def distribution(self, history: TensorDictBase) -> Source:
         """Return the source, in units of ``sigma``, for histories ``[*B]`` in the model's units."""

@@ -17,7 +17,7 @@ from warmprior import keys
 from warmprior.history import history_keys
 from warmprior.modules.generator import Drawing
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import ODEActor, Sampling
+from warmprior.modules.ode import ODEActor
 from warmprior.modules.prior import Prior, Source, noise_factor
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
@@ -237,6 +237,11 @@ class WarmPriorActor(TensorDictModuleBase):
             source_key=source_key,
             generator=generator,
         )
+        #: The options for drawing a chunk.
+        self.sampling = self.ode.sampling
+        self.observation_key, self.history_key = observation_key, history_key
+        #: True if the network sees the last actions, see :class:`~warmprior.HistoryObservation`.
+        self.sees_history = observation_key == keys.CONDITIONED
         self.normalizer = normalizer
         self.environment = environment
         #: Specs of outputs, by their keys.
@@ -259,26 +264,6 @@ class WarmPriorActor(TensorDictModuleBase):
     def network(self) -> nn.Module:
         """The velocity network."""
         return self.ode.network
-
-    @property
-    def sampling(self) -> Sampling:
-        """The options for drawing a chunk."""
-        return self.ode.sampling
-
-    @property
-    def observation_key(self) -> NestedKey:
-        """The key of the network's observation."""
-        return self.ode.observation_key
-
-    @property
-    def history_key(self) -> NestedKey:
-        """The key of the history."""
-        return self.sampler.history_key
-
-    @property
-    def sees_history(self) -> bool:
-        """True if the network sees the last actions, see :class:`~warmprior.HistoryObservation`."""
-        return self.observation_key == keys.CONDITIONED
 
     @dispatch(auto_batch_size=False)
     def forward(

@@ -81,6 +81,9 @@ class PriorDecoder(TensorDictModuleBase):
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         self.requires_grad_(False).eval()
+        self.prediction_length = actor.prior.prediction_length
+        #: The number ``d_a``, or ``None`` if the network does not have it.
+        self.action_dim = getattr(actor.network, "action_dim", None)
         self.observation_key = self.ode.observation_key
         self.in_keys = [self.observation_key, keys.ANCHOR, keys.DELTA]
         self.out_keys = [self.ode.in_keys[0], *self.ode.out_keys]
@@ -89,16 +92,6 @@ class PriorDecoder(TensorDictModuleBase):
     def network(self) -> nn.Module:
         """The frozen network."""
         return self.ode.network
-
-    @property
-    def prediction_length(self) -> int:
-        """``P``."""
-        return self.prior.prediction_length
-
-    @property
-    def action_dim(self) -> int | None:
-        """The number ``d_a``, or ``None`` if the network does not have it."""
-        return getattr(self.ode.network, "action_dim", None)
 
     @dispatch(auto_batch_size=False)
     @torch.no_grad()

@@ -142,6 +142,8 @@ class PriorSpaceTraining:
         self.actor, self.make_env, self.config = actor, make_env, config
         self.collect = collect
         self.directory = Path(directory)
+        #: The path of the training state.
+        self.state_path = self.directory / "state.safetensors"
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
@@ -164,11 +166,6 @@ class PriorSpaceTraining:
         }
         self._restored: float | None = None  # the time at which the restored state was written
         self._restore()
-
-    @property
-    def state_path(self) -> Path:
-        """The path of the training state."""
-        return self.directory / "state.safetensors"
 
     def run(self) -> list[dict[str, Any]]:
         """Collect, learn and evaluate to the end.

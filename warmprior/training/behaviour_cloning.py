@@ -114,6 +114,8 @@ class BehaviourCloning:
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
+        #: The path of the training state.
+        self.state_path = self.directory / "state.safetensors"
         self.logger = logger
         self.rank = rank()
         home = data.device or torch.device("cpu")
@@ -162,11 +164,6 @@ class BehaviourCloning:
         self._restore()
         if compile:
             self.update.compile()
-
-    @property
-    def state_path(self) -> Path:
-        """The path of the training state."""
-        return self.directory / "state.safetensors"
 
     def policy_path(self, iteration: int | None = None) -> Path:
         """Return the path of the policy kept after ``iteration``, by default the last one."""

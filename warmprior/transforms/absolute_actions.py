@@ -64,12 +64,8 @@ class AbsoluteActions(EnvTransform):
         rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
         check_shape("output_max of AbsoluteActions", scale, (6,))
         check_shape("base_rotation of AbsoluteActions", rotation, ("arms", 3, 3))
+        self.arms = len(rotation)
         self.scale, self.base_rotation = nn.Buffer(scale), nn.Buffer(rotation.double())
-
-    @property
-    def arms(self) -> int:
-        """The number of arms."""
-        return len(self.base_rotation)
 
     @property
     def one_step(self) -> Tensor:
