@@ -54,7 +54,7 @@ class FlowMatchingLoss(Drawing, LossModule):
         coupling: a function that pairs the sources and targets of a batch, see :data:`~warmprior.Coupling`;
             by default they are paired in order (Algorithm 1).
         times: the distribution of training times: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression), or a function with the signature :data:`Times`;
+            ``"start"`` (regression), or a function with the signature :data:`Times`;
             not with a coupling that has times of its own.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) leaves errors unchanged. ``"standardised"`` divides them by

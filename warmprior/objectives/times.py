@@ -14,7 +14,7 @@ from warmprior.checks import check_choice
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """A function that draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 
-TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
+TimesName = Literal["uniform", "u-shaped", "start"]
 
 STEEPNESS = 4.0
 """The constant ``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
@@ -44,13 +44,6 @@ def u_shaped_times(
     return t.clamp(0.0, 1.0)  # rounding may leave the interval
 
 
-def logit_normal_times(
-    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    r"""Draw times in the middle more often: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024)."""
-    return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
-
-
 def start_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
@@ -64,7 +57,6 @@ def start_times(
 TIMES: dict[str, Times] = {
     "uniform": uniform_times,
     "u-shaped": u_shaped_times,
-    "logit-normal": logit_normal_times,
     "start": start_times,
 }
 """The distributions of times, by name."""
