@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
 from warmprior.checks import check_positive, check_whole_numbers
@@ -89,12 +89,9 @@ class _Trunk(nn.Module):
             raise ValueError("in_keys is empty: the first is the observation")
         self.scales = [scales.get(unravel_key(key), 1.0) for key in in_keys]
         self.in_features = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
-        layers: list[nn.Module] = []
-        width = self.in_features
-        for _ in range(num_layers):
-            layers += [nn.Linear(width, hidden_dim), nn.LayerNorm(hidden_dim), nn.Tanh()]
-            width = hidden_dim
-        self.net = nn.Sequential(*layers, nn.Linear(hidden_dim, out_features))
+        norm: dict[str, Any] = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": hidden_dim}}
+        # Its activation is Tanh.
+        self.net = MLP(self.in_features, out_features, depth=num_layers, num_cells=hidden_dim, **norm)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         dtype = cast(nn.Linear, self.net[-1]).weight.dtype  # observations may be doubles
