@@ -50,7 +50,6 @@ def test_densities_in_units_of_the_box(delta):
         (GaussianPrior(P), 1.5, {}, stats.norm()),
         (PastPrior(P), 0.5, {"distribution": "normal"}, stats.norm(scale=0.5)),
         (PastPrior(P), 0.5, {"distribution": "uniform"}, stats.uniform(-0.5, 1.0)),
-        (PastPrior(P), 0.5, {"distribution": "truncated"}, stats.truncnorm(-1, 1, scale=0.5)),
         (PastPrior(P, sigma=2.0), 0.5, {"distribution": "normal"}, stats.norm(scale=2.0)),
     ],
 )
@@ -81,7 +80,7 @@ def test_residuals_are_as_large_as_the_source_deviates_from_the_anchor():
 
 def test_sampler_options():
     decoder = make_decoder(PastPrior(P), 0.5)
-    with raises(ValueError, "normal, clipped, truncated, uniform"):
+    with raises(ValueError, "normal, clipped, uniform"):
         ResidualSampler(decoder, distribution="laplace")
     with raises(ValueError, "'uniform'"):
         ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5), distribution="clipped")

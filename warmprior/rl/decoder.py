@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import nn
-from torch.nn.init import trunc_normal_
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
@@ -202,17 +201,17 @@ class PriorSpace(EnvTransform):
         return observation_spec
 
 
-ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
+ResidualDistribution = Literal["normal", "clipped", "uniform"]
 
 
 class ResidualSampler(Drawing, TensorDictModuleBase):
     r"""A sampler of residuals without an agent, for the warm-up and for distilling the noise critic.
 
     ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
-    ``"clipped"`` clips it to :math:`[-\delta, \delta]`, ``"truncated"`` draws again until it is inside, and
-    ``"uniform"`` draws from :math:`U[-\delta, \delta]`. Here :math:`\delta` is the decoder's, and
-    :math:`\sigma` the typical deviation of the source from the centre of the search: the prior's ``sigma``
-    around its mean, the start point's share of noise, or 1 around zero.
+    ``"clipped"`` clips it to :math:`[-\delta, \delta]`, and ``"uniform"`` draws from
+    :math:`U[-\delta, \delta]`. Here :math:`\delta` is the decoder's, and :math:`\sigma` the typical deviation
+    of the source from the centre of the search: the prior's ``sigma`` around its mean, the start point's
+    share of noise, or 1 around zero.
 
     ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
     (the environment's own random actions would be random *chunks* there).
@@ -265,13 +264,9 @@ class ResidualSampler(Drawing, TensorDictModuleBase):
         """Write the residual."""
         check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
         anchor = tensordict.get(self.in_keys[0])
-        generator = self.chosen_generator()
-        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": generator}
+        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.chosen_generator()}
         if self.distribution == "uniform":
             delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
-        elif self.distribution == "truncated":
-            box = (-self.delta, self.delta)
-            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=generator)
         else:
             delta = self.sigma * torch.randn(anchor.shape, **like)
         if self.distribution == "clipped":
