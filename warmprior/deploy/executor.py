@@ -11,7 +11,7 @@ from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecu
 from concurrent.futures import TimeoutError as NotDone
 from threading import RLock
 from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -110,9 +110,8 @@ class AsyncExecutor:
         pool: Executor | None = None,
         action_dim: int | None = None,
     ) -> None:
-        plain = cast(Any, uncompiled(actor))
-        network = getattr(plain, "network", None)
-        network = None if network is None else uncompiled(network)
+        plain = uncompiled(actor)
+        network = uncompiled(getattr(plain, "network", None))
         prior = getattr(plain, "prior", None) if prior is None else prior
         normalizer = getattr(plain, "normalizer", None) if normalizer is None else normalizer
         if action_dim is None:

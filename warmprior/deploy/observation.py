@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +29,8 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
         actor: the policy.
         prior: its source; by default ``actor.prior``.
     """
-    plain = cast(Any, uncompiled(actor))
-    network = getattr(plain, "network", None)
-    network = None if network is None else uncompiled(network)
+    plain = uncompiled(actor)
+    network = uncompiled(getattr(plain, "network", None))
     if (shapes := getattr(plain, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
         return shapes
     encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)

@@ -181,7 +181,7 @@ class TimestepEmbedding(nn.Module):
 _PREFIX = "_orig_mod."
 
 
-def uncompiled(module: nn.Module) -> nn.Module:
+def uncompiled(module: Any) -> Any:
     """Return the module inside a compiled one; any other is returned unchanged."""
     return getattr(module, _PREFIX[:-1], module)
 

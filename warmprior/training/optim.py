@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
 from warmprior.checks import check_share, check_whole_numbers
-from warmprior.modules.network import VelocityNetwork, uncompiled
+from warmprior.modules.network import uncompiled
 
 
 def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:
@@ -22,8 +22,7 @@ def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_de
 
     Biases, norms and position embeddings do not decay.
     """
-    groups = cast(VelocityNetwork, uncompiled(network)).parameter_groups(weight_decay)
-    return AdamW(groups, lr=learning_rate, fused=True)
+    return AdamW(uncompiled(network).parameter_groups(weight_decay), lr=learning_rate, fused=True)
 
 
 def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:

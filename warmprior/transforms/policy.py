@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Literal
 
 from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, Transform
@@ -73,7 +73,7 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
-    policy = cast(Any, uncompiled(cast(Any, policy)))
+    policy = uncompiled(policy)
     prior, history_key, chunk_key = policy, keys.HISTORY, keys.CHUNK
     if isinstance(policy, WarmPriorActor):
         prior, observed = policy.prior, policy.observation_key
