@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from http.client import HTTPException
 from pickle import UnpicklingError
@@ -44,9 +45,7 @@ def _resnet18() -> tuple[nn.Module, int]:
 
 
 def _small(crop_size: int) -> tuple[nn.Module, int]:
-    side = crop_size
-    for _ in range(3):
-        side = (side + 1) // 2
+    side = math.ceil(crop_size / 8)  # every convolution halves it, and rounds up
     convolutions = ConvNet(
         in_features=3, num_cells=[32, 64, 64], strides=2, paddings=1, activation_class=nn.ReLU
     )

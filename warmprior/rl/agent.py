@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.checks import (
+    check_between,
     check_choice,
     check_finite,
     check_finite_numbers,
@@ -104,10 +105,8 @@ class PriorSpaceConfig:
             raise ValueError("dsrl-sac has no noise critic: leave distillation out")
         check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)
         check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
-        check_positive(**given(delta=self.delta))
-        for name in ("gamma", "tau"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
+        check_positive(gamma=self.gamma, tau=self.tau, **given(delta=self.delta))
+        check_between(0, 1, gamma=self.gamma, tau=self.tau)
         counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
         sizes = ("noise_critic_steps", "hidden_dim", "num_layers")
         names = (*counts, *sizes, "evaluate_every", "evaluation_episodes")

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.checks import check_between, check_finite_numbers, check_keys, check_whole_numbers
+from warmprior.checks import check_between, check_keys, check_whole_numbers
 from warmprior.history import advance, cold_history, history_keys, without
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
@@ -62,19 +62,13 @@ class ActionHistory(EnvTransform):
         self._chunk = None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        history = tensordict.get(self.history_key, None)
-        if history is None:
-            raise KeyError(
-                f"ActionHistory found no {self.history_key!r} in a step's input: add the chunk to the "
-                "tensordict of the last reset or step, and step with that"
-            )
-        executed = next_tensordict.get(keys.EXECUTED)
-        if executed is None:
-            raise KeyError(
-                f"ActionHistory found no {keys.EXECUTED!r} after the step: append it after ChunkStep"
-            )
-        moved = advance(history, tensordict.get(self.in_keys[0]), executed)
-        next_tensordict.set(self.history_key, moved)
+        hint = " in a step's input: step with the tensordict of the last reset or step, and the chunk"
+        check_keys(tensordict, [self.history_key], "ActionHistory", hint)
+        check_keys(
+            next_tensordict, [keys.EXECUTED], "ActionHistory", " after a step: append it after ChunkStep"
+        )
+        history, chunk = tensordict.get(self.history_key), tensordict.get(self.in_keys[0])
+        next_tensordict.set(self.history_key, advance(history, chunk, next_tensordict.get(keys.EXECUTED)))
         # Rows that were not stepped have executed nothing.
         next_tensordict = keep_resting(tensordict, next_tensordict, self.out_keys)
         self._remember_ends(next_tensordict, [self.history_key])
@@ -135,16 +129,14 @@ class WithheldHistory(Transform):
 
     def __init__(self, probability: float, *, generator: torch.Generator | None = None) -> None:
         super().__init__(in_keys=[keys.HISTORY], out_keys=[keys.HISTORY])
-        check_finite_numbers(probability=probability)
         check_between(0.0, 1.0, probability=probability)
         self.probability = probability
         self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Make some rows cold."""
-        history = tensordict.get(keys.HISTORY, None)
-        if history is None:
-            raise KeyError("WithheldHistory found no history: append it after ActionWindow")
+        check_keys(tensordict, self.in_keys, "WithheldHistory", ": append it after ActionWindow")
+        history = tensordict.get(keys.HISTORY)
         if tensordict.get(keys.CONDITIONED, None) is not None:
             raise ValueError(
                 "the history is in the observation already: put WithheldHistory before HistoryObservation, "

@@ -93,9 +93,8 @@ class ActionWindow(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the windows of the sampled steps."""
+        check_keys(tensordict, self.in_keys, "ActionWindow", ": see window_replay_buffer")
         frame = tensordict.get(keys.FRAME)
-        if frame is None:
-            raise KeyError(f"ActionWindow needs steps at {keys.FRAME!r}: see window_replay_buffer")
         if frame.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"{keys.FRAME!r} holds step numbers and must be int64, got {frame.dtype}")
         batch, before = tensordict.batch_size, self.history_length
