@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from torch import Tensor
 
+from warmprior.data import replay
 from warmprior.data.replay import (
     BLOCK,
     DatasetError,
@@ -45,15 +46,9 @@ _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 _OBSERVE = "use the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
 
 
-@contextmanager
-def reading(parent: h5py.Group, name: str) -> Iterator[None]:
+def reading(parent: h5py.Group, name: str) -> AbstractContextManager[None]:
     """Turn any error inside into a DatasetError that names the file and the object below ``parent``."""
-    try:
-        yield
-    except DatasetError:
-        raise
-    except Exception as error:  # HDF5's errors share no base class: OSError, RuntimeError, KeyError...
-        raise DatasetError(f"{_place(parent, name)} cannot be read ({error}). {_AGAIN}") from error
+    return replay.reading(_place(parent, name), _AGAIN)
 
 
 def names(group: h5py.Group) -> list[str]:

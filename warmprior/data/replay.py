@@ -134,7 +134,7 @@ def reading(what: str, advice: str) -> Iterator[None]:
     """Turn any error inside into a DatasetError that says what cannot be read, with advice."""
     try:
         yield
-    except MemoryError:
+    except (DatasetError, MemoryError):
         raise
     except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
         raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
