@@ -19,7 +19,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.generator import Drawing
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import device_of, network_observation, velocity_field
-from warmprior.objectives.times import Times, chosen_times
+from warmprior.objectives.times import TIMES, Times
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
@@ -127,6 +127,8 @@ class FlowMatchingLoss(Drawing, LossModule):
         super().__init__()
         check_choice("objective", objective, get_args(Objective))
         check_choice("reduction", reduction, ("none", "mean", "sum"))
+        if not callable(times):
+            check_choice("times", times, TIMES)
         network, sampling = actor_network.network, actor_network.sampling
         # A functional copy of the network would turn Ctrl-C into another error, and exclude DDP.
         self.actor_network = actor_network
@@ -134,7 +136,7 @@ class FlowMatchingLoss(Drawing, LossModule):
         own = getattr(coupling, "times", None)  # a coupling may come with times, and a path, of its own
         if own is not None and times != "uniform":
             raise ValueError(f"{type(coupling).__name__} has its own times: leave out times={times!r}")
-        self.times = own or (times if callable(times) else chosen_times(times))
+        self.times = own or (times if callable(times) else TIMES[times])
         if times == "start" and (sampling.max_nfe != 1 or actor_network.ode.start_time > 0):
             raise ValueError(
                 "times = 'start' trains the field at t = 0 alone: build the policy with max_nfe=1, and "

@@ -9,8 +9,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice
-
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """A function that draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 
@@ -60,9 +58,3 @@ TIMES: dict[str, Times] = {
     "start": start_times,
 }
 """The distributions of times, by name."""
-
-
-def chosen_times(name: str) -> Times:
-    """Return the distribution with a name; raise ValueError, with the names, if there is none."""
-    check_choice("times", name, TIMES)
-    return TIMES[name]
