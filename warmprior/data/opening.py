@@ -55,13 +55,14 @@ class Demonstrations:
         kinds: dict[str, tuple[Any, Any]] = {
             LEROBOT: (read_lerobot_index, LeRobotDemonstrations),
             MINARI: (read_minari_index, MinariDemonstrations),
+            "": (read_index, RobomimicDemonstrations),
         }
-        self._prefix = next((p for p in kinds if dataset_name(place, p) is not None), None)
-        self._place: Any = Path(place) if self._prefix is None else dataset_name(place, self._prefix)
-        self._index, self._replay = kinds.get(self._prefix or "", (read_index, RobomimicDemonstrations))
+        self._prefix = next(prefix for prefix in kinds if str(place).startswith(prefix))
+        self._place: Any = str(place).removeprefix(self._prefix)
+        self._index, self._replay = kinds[self._prefix]
         if self._prefix == LEROBOT:
             self._options["env_args"] = env_args
-        name = Path(place).name if self._prefix is None else f"{self._prefix}{name_of_place(place)}"
+        name = f"{self._prefix}{name_of_place(place)}" if self._prefix else Path(place).name
         self.name = name if mask is None else f"{name} (mask {mask})"
 
     def image_keys(self, names: Sequence[str]) -> list[str]:
