@@ -10,6 +10,7 @@ from typing import Any, Literal
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from warmprior.checks import given
 from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.gymnasium import registered_env
 from warmprior.envs.robosuite import RobosuiteEnv
@@ -55,14 +56,12 @@ def environment_description(
         {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
          'observation_steps': 2}
     """
+    chosen = None if low_dim_keys is None else list(low_dim_keys)
+    options = given(low_dim_keys=chosen, horizon=horizon)
     description: dict[str, Any] = {
-        "robosuite": {"env_args": dict(env_args), "style": style},
+        "robosuite": {"env_args": dict(env_args), "style": style, **options},
         "observation_steps": observation_steps,
     }
-    if low_dim_keys is not None:
-        description["robosuite"]["low_dim_keys"] = list(low_dim_keys)
-    if horizon is not None:
-        description["robosuite"]["horizon"] = horizon
     if actions != "delta":
         description["actions"] = actions
     if images is not None:

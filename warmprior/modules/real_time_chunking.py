@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -89,10 +89,6 @@ class RealTimeChunking:
         check_whole_numbers(**given(horizon=self.horizon))
         check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
         check_not_negative(**given(sigma=self.sigma))
-
-    def config(self) -> dict[str, Any]:
-        """Return the options as JSON holds them."""
-        return asdict(self)
 
     def check_reach(self, delay: int, left: int) -> None:
         """Raise ValueError if the delay exceeds the horizon, or the rest of the old chunk."""

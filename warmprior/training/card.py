@@ -48,7 +48,8 @@ def model_card(
     )
     from warmprior.envs.description import environment_name
 
-    task = task or environment_name(actor)
+    name = environment_name(actor)
+    task = task or name
     rows = {**_facts(actor), **(facts or {}), "uploaded by": f"warmprior {version('warmprior')}"}
     parts = [
         f"---\n{data.to_yaml()}\n---",
@@ -59,7 +60,7 @@ def model_card(
         "## Success",
         success,
         "## Use",
-        _use(actor, repository),
+        _use(actor, repository, playable=name is not None),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -88,9 +89,7 @@ def _facts(actor: WarmPriorActor) -> dict[str, str]:
     }
 
 
-def _use(actor: WarmPriorActor, repository: str) -> str:
-    from warmprior.envs.description import environment_name
-
+def _use(actor: WarmPriorActor, repository: str, playable: bool) -> str:
     own = [
         f"{type(part).__name__} of {type(part).__module__}"
         for part in (actor.prior, actor.network)
@@ -98,7 +97,7 @@ def _use(actor: WarmPriorActor, repository: str) -> str:
     ]
     words = f"It needs classes of its author: import {' and '.join(own)} first.\n\n" if own else ""
     lines = ["from warmprior.training import load_policy", "", f'actor = load_policy("{repository}")']
-    if environment_name(actor) is not None:
+    if playable:
         lines.insert(1, "from warmprior.envs import environment_of")
         lines.append("environment_of(actor).rollout(100, actor)")
     return f"{words}```python\n" + "\n".join(lines) + "\n```"

@@ -117,7 +117,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         "actor": {
             **asdict(actor.sampling),
             **actor.tensor_keys,
-            "guidance": None if guidance is None else guidance.config(),
+            "guidance": None if guidance is None else asdict(guidance),
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,

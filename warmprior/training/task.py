@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.checks import check_choice, check_keys, check_whole_numbers
+from warmprior.checks import check_choice, check_keys, check_whole_numbers, given
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -224,8 +224,7 @@ class Task:
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.training import files
 
-        outcome: dict[str, Any] = {"success": success, "measures": measures, "video_rate": video_rate}
-        outcome = {name: value for name, value in outcome.items() if value is not None}
+        outcome = given(success=success, measures=measures, video_rate=video_rate)
         if outcome and make_env is None:
             raise ValueError(f"{', '.join(outcome)} of an environment of your own: pass its make_env as well")
         demonstrations = files.opened(place, task, mask)
