@@ -43,14 +43,12 @@ class SourceLeak:
         spread: standard deviation of predictions over draws of the source at fixed observation and mean, root
             mean square over windows, positions and dimensions.
         data_spread: standard deviation of the targets at similar observations, averaged in the same way.
-        ratio_to_last: ratio of ``spread`` to that at the largest ``nfe`` measured.
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
         data_inner_step: mean distance between consecutive actions inside the targets.
 
     Examples:
         >>> from warmprior.diagnostics import SourceLeak
-        >>> leak = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
-        ...                    inner_step=0.11, data_inner_step=0.1)
+        >>> leak = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, inner_step=0.11, data_inner_step=0.1)
         >>> round(leak.leak, 2), round(leak.inner_step_ratio, 2)
         (1.5, 1.1)
         >>> leak.warning
@@ -60,7 +58,6 @@ class SourceLeak:
     nfe: int
     spread: float
     data_spread: float
-    ratio_to_last: float
     inner_step: float
     data_inner_step: float
 
@@ -164,16 +161,11 @@ def source_leak(
                 chunk = predict(policy, rows, a0, nfe)
                 chunk = moments[nfe].add(chunk[:, :chunk_length])
                 steps[nfe] += _inner_step(chunk, counted) / draws
-    spread = {
-        nfe: math.sqrt(float(moment.variance(unbiased=True)[counted].mean()))
-        for nfe, moment in moments.items()
-    }
     return {
         nfe: SourceLeak(
             nfe=nfe,
-            spread=spread[nfe],
+            spread=math.sqrt(float(moments[nfe].variance(unbiased=True)[counted].mean())),
             data_spread=data_spread,
-            ratio_to_last=_ratio(spread[nfe], spread[allowed[-1]]),
             inner_step=steps[nfe],
             data_inner_step=_inner_step(target, counted),
         )
