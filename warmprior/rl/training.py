@@ -24,14 +24,7 @@ from warmprior.io.files import check_writable, exclusive
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
-from warmprior.training.checkpoint import (
-    as_key,
-    check_identity,
-    digest_of_state,
-    load_newer,
-    load_state,
-    save_state,
-)
+from warmprior.training.checkpoint import RunState, as_key, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate
 from warmprior.training.parallel import watched
 
@@ -142,8 +135,6 @@ class PriorSpaceTraining:
         self.actor, self.make_env, self.config = actor, make_env, config
         self.collect = collect
         self.directory = Path(directory)
-        #: The path of the training state.
-        self.state_path = self.directory / "state.safetensors"
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
@@ -164,7 +155,9 @@ class PriorSpaceTraining:
             "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
             "transitions": self._keys,
         }
-        self._restored: float | None = None  # the time at which the restored state was written
+        self._state = RunState(self.directory, self.identity)
+        #: The path of the training state.
+        self.state_path = self._state.path
         self._restore()
 
     def run(self) -> list[dict[str, Any]]:
@@ -335,22 +328,14 @@ class PriorSpaceTraining:
         if self.device.type == "cuda":
             tensors["rng_cuda"] = torch.cuda.get_rng_state(self.device)
         self.segments.write()
-        facts = {
-            "identity": self.identity,
-            "steps": self.steps,
-            "curve": self.curve,
-            "segments": self.segments.committed,
-        }
-        save_state(self.state_path, tensors, facts)
-        self._restored = self.state_path.stat().st_mtime
+        facts = {"steps": self.steps, "curve": self.curve, "segments": self.segments.committed}
+        self._state.save(tensors, **facts)
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        newer = load_newer(self.state_path, self._restored)
-        if newer is None:
+        if (newer := self._state.newer()) is None:
             return
-        self._restored, tensors, facts = newer
-        check_identity(self.state_path, facts["identity"], self.identity)
+        tensors, facts = newer
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         self.buffer.empty()

@@ -22,16 +22,14 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.training.checkpoint import (
-    check_identity,
+    RunState,
     data_digest,
     fixed_identity,
-    load_newer,
     named,
     part_identity,
     restore_rng,
     restoring,
     rng_tensors,
-    save_state,
     select,
 )
 from warmprior.training.gradient_step import GradientStep
@@ -114,8 +112,6 @@ class BehaviourCloning:
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
-        #: The path of the training state.
-        self.state_path = self.directory / "state.safetensors"
         self.logger = logger
         self.rank = rank()
         home = data.device or torch.device("cpu")
@@ -160,7 +156,9 @@ class BehaviourCloning:
         }
         torch.manual_seed(config.seed)
         self._differ()
-        self._restored: float | None = None  # the time at which the restored state was written
+        self._state = RunState(self.directory, self.identity)
+        #: The path of the training state.
+        self.state_path = self._state.path
         self._restore()
         if compile:
             self.update.compile()
@@ -289,9 +287,7 @@ class BehaviourCloning:
             **({} if self._prefetch is None else {"rng/windows": self._prefetch.state()}),
             "running": torch.stack(self._running) if self._running else torch.empty(0),
         }
-        facts = {"identity": self.identity, "iteration": self.iteration, "losses": self.losses}
-        save_state(self.state_path, tensors, facts)
-        self._restored = self.state_path.stat().st_mtime
+        self._state.save(tensors, iteration=self.iteration, losses=self.losses)
 
     def _differ(self) -> None:
         """Draw windows, sources, times, dropout and crops that differ from the other processes'."""
@@ -304,14 +300,9 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        newer = load_newer(self.state_path, self._restored)
-        if newer is None:
-            return
-        written, tensors, facts = newer
-        check_identity(self.state_path, facts.get("identity"), self.identity)
-        with restoring(self.state_path):
-            self._load(tensors, facts)
-        self._restored = written
+        if (newer := self._state.newer()) is not None:
+            with restoring(self.state_path):
+                self._load(*newer)
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
         self.iteration = facts["iteration"]

@@ -43,11 +43,29 @@ def load_state(
     return tensors, facts
 
 
-def load_newer(path: Path, known: float | None) -> tuple[float, dict[str, Tensor], dict[str, Any]] | None:
-    """Read a state, and when it was written; None if there is none, or it was written at the known time."""
-    if not path.exists() or (written := path.stat().st_mtime) == known:
-        return None
-    return written, *load_state(path)
+class RunState:
+    """The file ``state.safetensors`` of a run, which may be written by several processes in turn."""
+
+    def __init__(self, directory: Path, identity: Mapping[str, Any]) -> None:
+        self.path, self.identity = directory / "state.safetensors", identity
+        self._known: float | None = None  # when the state that this process has was written
+
+    def save(self, tensors: Mapping[str, Tensor], **facts: Any) -> None:
+        """Write the state, with the run's identity and JSON-serialisable facts."""
+        save_state(self.path, tensors, {"identity": self.identity, **facts})
+        self._known = self.path.stat().st_mtime
+
+    def newer(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """Return tensors and facts of a state that this process does not have yet, or None.
+
+        Raises ValueError if it is damaged, or that of another run.
+        """
+        if not self.path.exists() or (written := self.path.stat().st_mtime) == self._known:
+            return None
+        tensors, facts = load_state(self.path)
+        check_identity(self.path, facts.get("identity"), self.identity)
+        self._known = written
+        return tensors, facts
 
 
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
