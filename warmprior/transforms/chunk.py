@@ -58,11 +58,8 @@ class LateTransforms:
         self._step, self._action_key = step, action_key
         self._transforms = step.transforms
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
-        # Actions are inverted from the last transform to the first: those after the last one that looks at
-        # the state can take all of them at once.
-        looking = (i for i, t in enumerate(self._transforms) if isinstance(t, AbsoluteActions))
-        first = 1 + max(looking, default=-1)
-        self._one_by_one, self._at_once = self._transforms[:first], self._transforms[first:]
+        # Actions are inverted from the last transform to the first.
+        self._inverse = [t for t in reversed(self._transforms) if t.in_keys_inv]
 
     @classmethod
     def of(
@@ -93,7 +90,7 @@ class LateTransforms:
 
         ``current`` becomes the input of the last step, in place; only that step's result is transformed.
         """
-        results = [first, *self._steps(current, first, self._inverse(actions), reward_key)]
+        results = [first, *self._steps(current, first, actions, reward_key)]
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
         return results
@@ -103,25 +100,17 @@ class LateTransforms:
     ) -> list[TensorDictBase]:
         """Take one step after the other, untransformed."""
         results: list[TensorDictBase] = []
-        for action in actions.unbind(0):
+        for action in actions.unbind(-2):
             update_input(current, results[-1] if results else first, reward_key)
             if current["done"].any():
                 break
             # The constructor's checks are skipped: all entries come from tensordicts of this batch size.
             entries = current | {self._action_key: action}
             inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
-            for transform in reversed(self._one_by_one):
+            for transform in self._inverse:
                 inputs = transform._inv_call(inputs)
             results.append(self._step.bare(inputs))
         return results
-
-    def _inverse(self, actions: Tensor) -> Tensor:
-        # All of them at once, time first, so that per-row parameters of a transform broadcast.
-        actions = actions.movedim(-2, 0)
-        for transform in reversed(self._at_once):
-            if transform.in_keys_inv:
-                actions = transform._inv_apply_transform(actions)
-        return actions
 
     def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:
         # Results further back than the transforms reach have no influence, so `before` may be older.
