@@ -90,18 +90,9 @@ class LateTransforms:
 
         ``current`` becomes the input of the last step, in place; only that step's result is transformed.
         """
-        results = [first, *self._steps(current, first, actions, reward_key)]
-        if len(results) > 1:
-            results[-1] = self._transformed(first, results[1:])
-        return results
-
-    def _steps(
-        self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
-    ) -> list[TensorDictBase]:
-        """Take one step after the other, untransformed."""
-        results: list[TensorDictBase] = []
+        results = [first]
         for action in actions.unbind(-2):
-            update_input(current, results[-1] if results else first, reward_key)
+            update_input(current, results[-1], reward_key)
             if current["done"].any():
                 break
             # The constructor's checks are skipped: all entries come from tensordicts of this batch size.
@@ -110,6 +101,8 @@ class LateTransforms:
             for transform in self._inverse:
                 inputs = transform._inv_call(inputs)
             results.append(self._step.bare(inputs))
+        if len(results) > 1:
+            results[-1] = self._transformed(first, results[1:])
         return results
 
     def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:

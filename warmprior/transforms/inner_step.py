@@ -88,9 +88,8 @@ class InnerStep:
         self.restarts = Restarts(container, before)
         states = set(self.base.state_spec.keys(True, True))
         self.observed = [key for key in self.base.observation_spec.keys(True, True) if key not in states]
-        done_spec = self.base.full_done_spec
-        self._done_spec = done_spec
-        self._done_shapes = [(key, spec.shape) for key, spec in done_spec.items(True, True)]
+        self._done_spec = self.base.full_done_spec
+        self._done_shapes = [(key, spec.shape) for key, spec in self._done_spec.items(True, True)]
         inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
