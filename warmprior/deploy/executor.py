@@ -156,6 +156,7 @@ class AsyncExecutor:
         self._pool = pool
         self._expected = expected
         self._delays: deque[int] = deque(maxlen=window)
+        self._stacked = observation_steps
         self._frames: deque[Tensor | TensorDictBase] = deque(maxlen=observation_steps)
         self._lock = RLock()
         self._pending: Future[Tensor] | None = None
@@ -205,7 +206,8 @@ class AsyncExecutor:
         with self._lock:
             if self._closed:
                 raise RuntimeError("the executor is closed")
-            self._see(observation)
+            # An episode's first observation fills the stack.
+            self._frames.extend([self._observed(observation)] * (1 if self._frames else self._stacked))
             self._collect()
             if self._pending is None and (self._failed or self._executed >= min(self.execute, self._end)):
                 self._decide()
@@ -228,12 +230,6 @@ class AsyncExecutor:
     def _left(self) -> int:
         """The number of actions that are left to execute."""
         return self._end - self._executed
-
-    def _see(self, observation: Tensor | TensorDictBase | Mapping[str, Any]) -> None:
-        step = self._observed(observation)
-        self._frames.append(step)
-        while len(self._frames) < (self._frames.maxlen or 0):
-            self._frames.append(step)
 
     def _decide(self) -> None:
         """Begin a decision; the rest of the chunk moves to the positions of the new one.
