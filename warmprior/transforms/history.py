@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
+from torchrl.envs.utils import make_composite_from_td
 
 from warmprior import keys
 from warmprior.checks import check_between, check_keys, check_whole_numbers
@@ -82,9 +83,8 @@ class ActionHistory(EnvTransform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the history."""
         check_unwritten(observation_spec, self.out_keys, "ActionHistory")
-        for name, value in self._cold(self._check_chunk(), observation_spec).items():
-            spec = Unbounded(value.shape, dtype=value.dtype, device=observation_spec.device)
-            observation_spec[unravel_key((self.history_key, name))] = spec
+        cold = self._cold(self._check_chunk(), observation_spec)
+        observation_spec[self.history_key] = make_composite_from_td(cold)
         return observation_spec
 
     def _cold(self, chunk: TensorSpec, place: TensorDictBase | TensorSpec) -> TensorDictBase:
