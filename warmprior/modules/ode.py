@@ -88,23 +88,13 @@ GUIDED_BY_WHOM = (
 )
 
 
-@dataclass(frozen=True)
-class _Tableau:
-    """An explicit Runge-Kutta method: nodes ``c``, rows ``a`` below the diagonal, weights ``b``."""
-
-    c: tuple[float, ...]
-    a: tuple[tuple[float, ...], ...]
-    b: tuple[float, ...]
-
-
-SOLVERS: dict[str, _Tableau] = {
-    "euler": _Tableau((0.0,), ((),), (1.0,)),
-    "midpoint": _Tableau((0.0, 0.5), ((), (0.5,)), (0.0, 1.0)),
-    "heun": _Tableau((0.0, 1.0), ((), (1.0,)), (0.5, 0.5)),
-    "rk4": _Tableau(
-        (0.0, 0.5, 0.5, 1.0), ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-    ),
+SOLVERS: dict[str, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] = {
+    "euler": (((),), (1.0,)),
+    "midpoint": (((), (0.5,)), (0.0, 1.0)),
+    "heun": (((), (1.0,)), (0.5, 0.5)),
+    "rk4": (((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 }
+"""Explicit Runge-Kutta methods: rows below the diagonal, whose sums are the nodes, and weights."""
 
 Solver = Literal["euler", "midpoint", "heun", "rk4"]
 
@@ -112,7 +102,7 @@ Solver = Literal["euler", "midpoint", "heun", "rk4"]
 def _steps(nfe: int, solver: str) -> int:
     if solver not in SOLVERS:
         raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
-    stages = len(SOLVERS[solver].b)
+    stages = len(SOLVERS[solver][0])
     if not isinstance(nfe, Integral) or not 0 < nfe <= MAX_NFE or nfe % stages:
         raise ValueError(
             f"nfe is the number of network evaluations: it must be at most {MAX_NFE} and a "
@@ -163,18 +153,18 @@ def integrate(
     """
     steps = _steps(nfe, solver)
     check_share(start_time=start_time)
-    tableau = SOLVERS[solver]
+    rows, weights = SOLVERS[solver]
     a = a0
     path = [a0]
     for begin, end, count in grid_parts(grid, steps, start_time=start_time):
         h = (end - begin) / count
         for step in range(count):
             slopes: list[Tensor] = []
-            for node, row in zip(tableau.c, tableau.a, strict=True):
-                time = begin + (step + node) * h
+            for row in rows:
+                time = begin + (step + sum(row)) * h
                 t = torch.full(a.shape[:1], time, dtype=a.dtype, device=a.device)
                 slopes.append(velocity(t, _combine(a, h, row, slopes)))
-            a = _combine(a, h, tableau.b, slopes)
+            a = _combine(a, h, weights, slopes)
             if return_path:
                 path.append(a)
     return torch.stack(path, dim=1) if return_path else a
@@ -229,7 +219,7 @@ class Sampling:
         if nfe is None:
             nfe = DEFAULT_NFE if self.max_nfe is None else min(DEFAULT_NFE, self.max_nfe)
             if self.solver in SOLVERS:  # rounded down to a multiple of the stages
-                stages = len(SOLVERS[self.solver].b)
+                stages = len(SOLVERS[self.solver][0])
                 nfe = max(nfe - nfe % stages, stages)
         _steps(nfe, self.solver)
         if self.max_nfe is not None and nfe > self.max_nfe:
