@@ -8,8 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
-from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
+from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
@@ -258,7 +257,6 @@ def window_replay_buffer(
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator must be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
-        sampler=RandomSampler(),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
         transform=windows,
