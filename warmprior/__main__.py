@@ -23,8 +23,9 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import Sampling
 from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
-from warmprior.training import NetworkOptions, Task, TrainingConfig, train_policy
+from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, model_card, train_policy
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.saved import check_repository, policy_config, policy_file, push_policy
 from warmprior.transforms.window import window_transforms
 
 Imported = tyro.conf.UseAppendAction[
@@ -36,8 +37,6 @@ Policy = Annotated[str, tyro.conf.arg(metavar="FOLDER")]
 
 
 def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPriorActor:
-    from warmprior.training.saved import load_policy
-
     for module in modules:
         importlib.import_module(module)
     return load_policy(folder, revision=revision)
@@ -54,7 +53,6 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     """
     from warmprior.deploy.observation import observation_shapes
     from warmprior.envs.description import environment_name
-    from warmprior.training.saved import policy_config, policy_file
 
     actor = _policy(folder, revision, modules)
     config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
@@ -97,9 +95,6 @@ def push(
         revision: branch of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
-    from warmprior.training.card import model_card
-    from warmprior.training.saved import check_repository, push_policy
-
     check_repository(repository)
     if not Path(folder).is_dir():
         raise FileNotFoundError(f"no policy at {folder}: there is no such folder")
