@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from warmprior.data.images import check_images
 from warmprior.data.opening import Demonstrations
@@ -35,27 +35,17 @@ def image_names(cameras: Sequence[str]) -> list[str]:
 
 
 def recorded_task(
-    dataset: DemonstrationReplay,
-    images: Mapping[str, Any] | None,
-    *,
-    style: str,
-    observation_steps: int,
-    actions: Literal["delta", "absolute"],
-    horizon: int | None,
+    dataset: DemonstrationReplay, images: Mapping[str, Any] | None, **options: Any
 ) -> dict[str, Any]:
-    """Return data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`."""
+    """Return data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`.
+
+    The options are those of :func:`~warmprior.envs.environment_description`.
+    """
     low_dim_keys = None
     if images is None and (dataset.task is None or dataset.observation_keys != dataset.task.low_dim_keys):
         low_dim_keys = dataset.observation_keys
-    description = environment_description(
-        dataset.env_args,
-        style,
-        observation_steps,
-        actions,
-        images,
-        low_dim_keys=low_dim_keys,
-        horizon=horizon,
-    )
+    options |= {"images": images, "low_dim_keys": low_dim_keys}
+    description = environment_description(dataset.env_args, **options)
     make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: errors and sigma have the same meaning in both spaces, and the loss does
     # not give positions, whose range is large, little weight compared with the gripper.
