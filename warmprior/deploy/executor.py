@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from threading import RLock
-from types import TracebackType
 from typing import Any, Self
 
 import torch
@@ -321,9 +320,7 @@ class AsyncExecutor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
