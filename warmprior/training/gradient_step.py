@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, cast
 
 import torch
@@ -64,14 +63,6 @@ class GradientStep:
         if world_size() > 1:
             self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
         self._device = generator.device if generator is not None else torch.device("cpu")
-        # Without the cache, which would return the weights that a coupling has cast without gradients.
-        self._precision = partial(
-            torch.autocast,
-            self._device.type,
-            torch.bfloat16,
-            enabled=config.precision == "bf16",
-            cache_enabled=False,
-        )
         self.optimizer = make_optimizer(
             actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -81,7 +72,7 @@ class GradientStep:
             self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self._graphs = False
-        self._max_grad_norm, self._count_padding = config.max_grad_norm, config.count_padding
+        self.config = config
 
     def compile(self) -> None:
         """Compile the network; on a GPU, with CUDA graphs."""
@@ -95,16 +86,18 @@ class GradientStep:
         Raises:
             ValueError: if the network cannot be compiled.
         """
-        if self._count_padding:
+        if self.config.count_padding:
             batch = batch.exclude(keys.IS_PAD)
         if self._graphs:  # the graphs may overwrite the outputs of the last step
             torch.compiler.cudagraph_mark_step_begin()
-        with self._precision():
+        low = self.config.precision == "bf16"
+        # Without the cache, which would return the weights that a coupling has cast without gradients.
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=low, cache_enabled=False):
             loss = self._forward(batch)
         self.optimizer.zero_grad()
         loss.backward()
-        if self._max_grad_norm is not None:  # gradients are already averaged over all processes
-            nn.utils.clip_grad_norm_(self.trained.parameters(), self._max_grad_norm)
+        if self.config.max_grad_norm is not None:  # gradients are already averaged over all processes
+            nn.utils.clip_grad_norm_(self.trained.parameters(), self.config.max_grad_norm)
         self.optimizer.step()
         self.schedule.step()
         self._average()
