@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ from torch import Tensor
 from warmprior.checks import check_shape
 from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_file, read_lerobot_index
 from warmprior.data.replay import (
-    DatasetIndex,
     DemonstrationReader,
     DemonstrationReplay,
+    Opened,
     reading,
     store_finite,
 )
@@ -190,7 +190,6 @@ class LeRobotDemonstrations(DemonstrationReplay):
         self._own: dict[str, Any] = {"revision": revision, "env_args": env_args, "episodes": episodes}
         super().__init__(place, **kwargs)
 
-    @contextmanager
-    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
         index = read_lerobot_index(place, fetch=True, **self._own, **chosen)
-        yield index, LeRobotReader(index)
+        return index, LeRobotReader(index)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from warmprior.data.replay import (
     DatasetIndex,
     DemonstrationReader,
     DemonstrationReplay,
+    Opened,
     check_count,
     common_size,
     reading,
@@ -203,10 +204,9 @@ class MinariDemonstrations(DemonstrationReplay):
         torch.Size([256, 39])
     """
 
-    @contextmanager
-    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
         index = read_minari_index(place, **chosen)
-        yield index, MinariReader(place, index.path)
+        return index, MinariReader(place, index.path)
 
 
 def minari_environment(name: str) -> dict[str, Any] | None:

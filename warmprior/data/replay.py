@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -110,6 +110,10 @@ class DemonstrationReader(ABC):
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
         """Return the name of a demo's array for errors, with the file that holds it."""
+
+
+Opened = tuple[DatasetIndex, DemonstrationReader]
+"""The index of demonstrations, and a reader of their values."""
 
 
 def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
@@ -420,7 +424,8 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         chosen: dict[str, Any] = {"filter_key": filter_key, "observation_keys": observation_keys}
         chosen |= {"image_keys": image_keys, "poses": absolute_actions, "demos": demos}
-        with self._opened(place, **chosen) as (index, reader):
+        with ExitStack() as stack:
+            index, reader = self._opened(stack, place, **chosen)
             conventions = _conventions(index, absolute_actions)
             action_dim = index.action_dim if conventions is None else 10 * len(conventions[1])
             data = _allocate(index, action_dim, storage, scratch_dir)
@@ -442,10 +447,8 @@ class DemonstrationReplay(TensorDictReplayBuffer):
             **kwargs,
         )
 
-    def _opened(
-        self, place: Any, **chosen: Any
-    ) -> AbstractContextManager[tuple[DatasetIndex, DemonstrationReader]]:
-        """Open the demonstrations at a place: their index and a reader of their values."""
+    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
+        """Open the demonstrations at a place, until the stack ends."""
         raise NotImplementedError
 
     @property

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from typing import Any
 
 from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
-from warmprior.data.replay import DatasetIndex, DemonstrationReader, DemonstrationReplay
+from warmprior.data.replay import DemonstrationReplay, Opened
 
 
 class RobomimicDemonstrations(DemonstrationReplay):
@@ -64,8 +63,6 @@ class RobomimicDemonstrations(DemonstrationReplay):
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
-    @contextmanager
-    def _opened(self, place: Any, **chosen: Any) -> Iterator[tuple[DatasetIndex, DemonstrationReader]]:
+    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
         index = read_index(place, **chosen)
-        with open_robomimic(place) as file:
-            yield index, RobomimicReader(file)
+        return index, RobomimicReader(stack.enter_context(open_robomimic(place)))
