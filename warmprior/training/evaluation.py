@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -241,24 +241,19 @@ def evaluate(
     check_whole_numbers(episodes=episodes)
     if len(env.batch_size) > 1:
         raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
+    options: dict[str, Any] = {"nfe": nfe, "policy_seed": policy_seed, "success": success}
+    options["measures"] = measures or {}
+    seeds = range(first_seed, first_seed + episodes)
+    played = (play_episode(policy, env, seed, **options) for seed in seeds)
+    if env.batch_size:
+        played = _play_batched(policy, env, seeds, **options)
     outcomes: list[Episode] = []
     hidden = given(disable=description is None or None)  # given, it would overrule TQDM_DISABLE
-    bar = tqdm(total=episodes, desc=description, unit="ep", **hidden)
-
-    def report(outcome: Episode) -> None:
-        outcomes.append(outcome)
-        bar.update()
-        wins = sum(outcome.success for outcome in outcomes)
-        bar.set_postfix(success=f"{wins / len(outcomes):.2f}", refresh=False)
-
-    seeds = range(first_seed, first_seed + episodes)
-    with bar:
-        if env.batch_size:
-            _play_batched(policy, env, seeds, nfe, policy_seed, success, measures or {}, report)
-        else:
-            criteria: dict[str, Any] = {"success": success, "measures": measures}
-            for seed in seeds:
-                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed, **criteria))
+    with tqdm(played, description, episodes, unit="ep", **hidden) as bar:
+        for outcome in bar:
+            outcomes.append(outcome)
+            wins = sum(outcome.success for outcome in outcomes)
+            bar.set_postfix(success=f"{wins / len(outcomes):.2f}", refresh=False)
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 
 
@@ -271,8 +266,7 @@ def _play_batched(
     policy_seed: int,
     success: NestedKey,
     measures: Measures,
-    report: Callable[[Episode], None],
-) -> None:
+) -> Generator[Episode]:
     num_envs = env.batch_size[0]
     _check_fit(policy, env, (success, *measures))
     home = env.device or torch.device("cpu")
@@ -297,7 +291,7 @@ def _play_batched(
                 tallies[i].add(after[i], decided[i])
             for i in done.nonzero().flatten().tolist():
                 episode = i + num_envs * played[i]
-                report(tallies[i].episode(seeds[episode]))
+                yield tallies[i].episode(seeds[episode])
                 tallies[i] = _Tally(success, measures)
                 played[i] += 1
                 if episode + num_envs < len(seeds):
