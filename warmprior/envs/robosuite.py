@@ -22,11 +22,6 @@ from warmprior.envs.tasks import low_dim_keys as default_keys
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 
-_FLAGS = keys.SUCCESS, "terminated", "truncated", "done"
-
-_Flags = tuple[bool, bool, bool, bool]
-"""The flags of a control step, in the order of the keys above."""
-
 
 class RobosuiteEnv(EnvBase):
     """A robosuite environment: a task by its short name, that of a robomimic file, or your own.
@@ -244,17 +239,14 @@ class RobosuiteEnv(EnvBase):
             measured[keys.EEF_POSE] = np.stack(poses).astype(np.float32)
         return measured
 
-    def _count(self, success: bool) -> _Flags:
-        """Count a control step, and return its flags."""
-        self._elapsed += 1
-        terminated = success and self.terminate_on_success
-        out_of_time = self.horizon is not None and self._elapsed >= self.horizon
-        return success, terminated, out_of_time and not terminated, terminated or out_of_time
-
-    def _tell(self, flags: _Flags, observations: Mapping[str, np.ndarray]) -> TensorDictBase:
+    def _tell(self, observations: Mapping[str, np.ndarray], success: bool = False) -> TensorDictBase:
         """Return the result of a step."""
-        entry: dict[str, Any] = {"reward": torch.tensor([float(flags[0])])}
-        entry |= {name: torch.tensor([flag]) for name, flag in zip(_FLAGS, flags, strict=True)}
+        terminated = success and self.terminate_on_success
+        truncated = self._elapsed >= self.horizon and not terminated
+        flags = {keys.SUCCESS: success, "terminated": terminated, "truncated": truncated}
+        flags["done"] = terminated or truncated
+        entry: dict[str, Any] = {"reward": torch.tensor([float(success)])}
+        entry |= {name: torch.tensor([flag]) for name, flag in flags.items()}
         for key, value in self._measure(observations).items():
             entry[key] = TensorDict(value) if isinstance(value, dict) else torch.from_numpy(value)
         # The constructor's checks are skipped, because they take longer than all of the above.
@@ -265,9 +257,10 @@ class RobosuiteEnv(EnvBase):
         observations = self.loop.reset(self.episode_seed)
         self._episode += 1
         self._elapsed = 0
-        return self._tell((False, False, False, False), observations).exclude("reward")
+        return self._tell(observations).exclude("reward")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(keys.ACTION).detach().cpu().double().numpy()
         observations, success = self.loop.step(action)
-        return self._tell(self._count(success), observations)
+        self._elapsed += 1
+        return self._tell(observations, success)
