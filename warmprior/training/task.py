@@ -127,11 +127,13 @@ class Task:
         if isinstance(data[OBSERVATION], TensorDictBase):
             vector = (OBSERVATION, STATE)
             check_keys(data, [vector], f"the demonstrations of {name}", ", the robot's state next to images")
-            for key, image in data[OBSERVATION].items():
-                if key != STATE and (image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3):
+            sizes: set[int] = set()
+            for key, image in data[OBSERVATION].exclude(STATE).items():
+                sizes.update(image.shape[2:])
+                if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3 or len(sizes) > 1:
                     raise ValueError(
                         f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, but images must "
-                        "be uint8 [N, 3, size, size]"
+                        "be uint8 [N, 3, size, size], of one size for all cameras: crop or resize them"
                     )
         for key in (vector, ACTION):
             if data[key].ndim != 2:
