@@ -73,8 +73,8 @@ def check_device(device: torch.device | str) -> None:
     try:
         # Compute and read a value: some devices exist only by name, such as meta.
         torch.ones(1, device=device).add(1).item()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
         raise ValueError(
             f"the device {device} does not work here ({reason}): choose another, such as cpu"
         ) from error
@@ -114,7 +114,8 @@ def check_finite_steps(key: NestedKey, value: Tensor, memory: int = 2**22) -> No
         return
     steps = max(1, memory * len(value) // max(1, value.numel()))
     for first in range(0, len(value), steps):
-        finite = torch.isfinite(value[first : first + steps]).flatten(1).all(1)
+        part = torch.isfinite(value[first : first + steps])
+        finite = part.reshape(len(part), -1).all(1)
         if not finite.all():
             bad = first + int((~finite).nonzero()[0])
             raise ValueError(f"{key!r} holds NaN or Inf, first at step {bad}")

@@ -95,3 +95,7 @@ def test_vectors_of_whole_numbers_are_read_as_floats(dtype):
     t, a = torch.rand(5), torch.randn(5, 4, 2)
     expected = velocity_field(network, observation.float())(t, a)
     assert torch.equal(velocity_field(network, observation)(t, a), expected)
+    if dtype == torch.int64:  # an encoder of one's own reads them as they are
+        network.encodes, table = True, torch.nn.Embedding(2, 1)
+        network.encode = lambda observation: table(observation).squeeze(-1)
+        assert velocity_field(network, observation)(t, a).shape == (5, 4, 2)

@@ -142,6 +142,10 @@ def test_tiny_actions_are_told_of():
     raw["action"][:, 1] = 1e-6 * torch.linspace(-1, 1, 40)
     with pytest.warns(UserWarning, match=r"\[1\].*constant"):
         Normalizer.fit(raw)
+    raw["action"][:, 1] = 1e-9 * torch.randn(40)
+    with warnings.catch_warnings(action="error"):
+        Normalizer.fit(raw)
+        Normalizer.fit(TensorDict({"observation": torch.randn(9), "action": torch.randn(9)}, [9]))  # numbers
     raw["action"][:, 1] = 1000 + 1e-4 * torch.linspace(-1, 1, 40)  # rounding noise
     with warnings.catch_warnings(action="error"):
         Normalizer.fit(raw)

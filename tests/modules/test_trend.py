@@ -144,6 +144,8 @@ def test_a_cast_trend_keeps_its_units(dtype):
     normalised = units.normalize(joints)["observation"]
     expected = rest(normalised)
     torch.testing.assert_close(rest.to(dtype)(normalised.to(dtype)).float(), expected, atol=0.02, rtol=0)
+    trend = PoseTrend(rest, torch.zeros(2), torch.zeros(4, 2), torch.ones(4, 2)).to(dtype)
+    assert {part.dtype for part in trend(normalised.to(dtype).unsqueeze(1))} == {dtype}
 
 
 def test_config_and_state_bring_it_back():

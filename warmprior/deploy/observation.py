@@ -95,7 +95,7 @@ class RobotObservation:
             observation = dict.fromkeys(self.shapes, observation)
         given = {name: value for name, value in observation.items() if value is not None}
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
-        given |= {name: () for name, shape in self.shapes.items() if not shape[0]}
+        given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
         check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
         entries = {name: _fitted(name, given[name], shape) for name, shape in self.shapes.items()}
         return next(iter(entries.values())) if self._vector else TensorDict(entries)

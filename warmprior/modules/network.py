@@ -121,11 +121,11 @@ def velocity_field(
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
     """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
-    dtype = precision_of(network)
+    dtype, encodes = precision_of(network), getattr(network, "encodes", False)
 
     def cast(value: Tensor) -> Tensor:
-        # Vectors [B, To, d] may be integers or flags; images stay integers until they are encoded.
-        number = value.is_floating_point() or value.ndim <= 3
+        # Vectors [B, To, d] may be integers or flags; what is encoded, such as images, stays as it is.
+        number = value.is_floating_point() or (value.ndim <= 3 and not encodes)
         return value if dtype is None or not number else value.to(dtype)
 
     inputs: Any = observation.apply(cast) if isinstance(observation, TensorDictBase) else cast(observation)

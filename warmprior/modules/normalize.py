@@ -50,7 +50,7 @@ def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
 
 def warn_of_tiny(half: Tensor, middle: Tensor) -> None:
     """Warn of actions that count as constant although half their range is more than rounding noise."""
-    tiny = (half < LEAST) & (half > LEAST / 10 * middle.abs())
+    tiny = (half < LEAST) & (half > LEAST / 10 * middle.abs().clamp_min(0.01))
     if tiny.any():
         warnings.warn(
             f"the actions {tiny.nonzero().flatten().tolist()} vary by less than {2 * LEAST:g} and count as "

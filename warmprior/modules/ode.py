@@ -208,7 +208,8 @@ class Sampling:
         check_grid(self.grid)
         if isinstance(self.clip, Sequence):
             object.__setattr__(self, "clip", tuple(self.clip))
-            check_not_negative(**{f"clip[{i}]": bound for i, bound in enumerate(self.clip)})
+            if not (self.clip and all(bound >= 0 for bound in self.clip)):
+                raise ValueError(f"clip must be a bound >= 0 per action dimension, got {self.clip}")
         else:
             check_positive(**given(clip=self.clip))
         check_not_negative(**given(temperature=self.temperature))

@@ -218,7 +218,8 @@ class PoseTrend(nn.Module):
         They depend on the last step of normalised observations ``[B, To, d_o]``, or of the ``"state"`` in
         observations with images.
         """
-        deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).unsqueeze(1)
+        # The resting action is in the precision of its units, which a cast does not lower.
+        deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).to(self.source.dtype).unsqueeze(1)
         return deviation * self.source, deviation * self.target
 
 

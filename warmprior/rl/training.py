@@ -333,9 +333,9 @@ class PriorSpaceTraining:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        if (newer := self._state.newer()) is None:
-            return
-        tensors, facts = newer
+        self._state.restore(self._load)
+
+    def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         self.buffer.empty()

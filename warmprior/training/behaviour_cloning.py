@@ -300,9 +300,7 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        if (newer := self._state.newer()) is not None:
-            with restoring(self.state_path):
-                self._load(*newer)
+        self._state.restore(restoring(self.state_path)(self._load))
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
         self.iteration = facts["iteration"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,17 +55,17 @@ class RunState:
         save_state(self.path, tensors, {"identity": self.identity, **facts})
         self._known = self.path.stat().st_mtime
 
-    def newer(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """Return tensors and facts of a state that this process does not have yet, or None.
+    def restore(self, load: Callable[[dict[str, Tensor], dict[str, Any]], None]) -> None:
+        """Call ``load`` with tensors and facts of the state, if this process does not have it yet.
 
         Raises ValueError if it is damaged, or that of another run.
         """
         if not self.path.exists() or (written := self.path.stat().st_mtime) == self._known:
-            return None
+            return
         tensors, facts = load_state(self.path)
         check_identity(self.path, facts.get("identity"), self.identity)
+        load(tensors, facts)
         self._known = written
-        return tensors, facts
 
 
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
