@@ -134,8 +134,8 @@ def sentences() -> dict[str, list[str]]:
     past_one_loss = whole(board.loc[f"{PAST},l1", 9]["mean"])
     return {
         "../README.md": [
-            f"the Gaussian source solves {one_loss[GAUSSIAN][9]}% and WP-Past with correlated noise "
-            f"{one_loss[CORRELATED][9]}",
+            f"the Gaussian source solves {one_loss[GAUSSIAN][9]}%, WP-Past {past_one_loss} and WP-Past with "
+            f"correlated noise {one_loss[CORRELATED][9]}",
             f"without a source, solves {whole(mip['mean'])}%",
             f"solves {whole(board.loc[PAST, 9]['mean'])}% of the episodes and the Gaussian source "
             f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
