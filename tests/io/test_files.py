@@ -59,10 +59,10 @@ def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
 def test_tensors_are_written_as_any_other_file(tmp_path):
     plain, tensors = tmp_path / "plain", tmp_path / "tensors"
     plain.touch()
-    save_file({"a": torch.arange(3)}, tensors, {"told": "yes"})
+    save_file({"a": torch.arange(3)}, tensors, {"note": "kept"})
     assert tensors.stat().st_mode == plain.stat().st_mode
-    found, told = read_tensors(tensors.read_bytes())
-    assert found["a"].tolist() == [0, 1, 2] and told == {"told": "yes"}
+    found, metadata = read_tensors(tensors.read_bytes())
+    assert found["a"].tolist() == [0, 1, 2] and metadata == {"note": "kept"}
 
 
 def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):

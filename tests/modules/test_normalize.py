@@ -137,7 +137,7 @@ def test_errors():
         Normalizer(one, {"b": torch.zeros(2)})
 
 
-def test_tiny_actions_are_told_of():
+def test_a_warning_names_tiny_actions():
     raw = data()
     raw["action"][:, 1] = 1e-6 * torch.linspace(-1, 1, 40)
     with pytest.warns(UserWarning, match=r"\[1\].*constant"):

@@ -15,7 +15,6 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
 from warmprior.checks import check_finite_steps, check_keys, check_shape
-from warmprior.keys import ACTION
 
 LEAST = 1e-5
 """Half the range up to which a dimension counts as constant, in its unit, or as a share of its middle."""
@@ -117,6 +116,8 @@ class Normalizer(RawUnits):
             first, last = (value[key].to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first
             constant = half <= LEAST * loc.abs().clamp_min(1.0)
+            if key == keys.ACTION:
+                warn_of_tiny(half, loc)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 
@@ -156,10 +157,7 @@ class Normalizer(RawUnits):
             middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
             half = torch.where(unit > 0, unit.to(half), half)
             low[key], high[key] = middle - half, middle + half
-        fitted = cls(low, high)
-        if ACTION in low:
-            warn_of_tiny((high[ACTION].double() - low[ACTION].double()) / 2, fitted.loc(ACTION))
-        return fitted
+        return cls(low, high)
 
     @property
     def positive(self) -> list[str]:
