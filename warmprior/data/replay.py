@@ -18,13 +18,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
-from tqdm import tqdm
 
-from warmprior.checks import check_choice, check_whole_numbers, given
+from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import declared_actions, delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
+from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
@@ -378,8 +378,7 @@ def _fill(
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
     # A bar only for images, which take long because they are unpacked one by one.
-    hidden = given(disable=not index.image_keys or None)  # given, it would overrule TQDM_DISABLE
-    bar = tqdm(index.demos, f"read {index.path.name}", unit="demo", **hidden)
+    bar = progress_bar(f"read {index.path.name}" if index.image_keys else None, index.demos, unit="demo")
     for episode, (demo, (start, stop)) in enumerate(zip(bar, pairwise(rows), strict=True)):
         for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
             reader.numbers(demo, f"obs/{key}", observation[start:stop, left:right])

@@ -16,11 +16,11 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.checks import check_finite, check_keys, given
+from warmprior.checks import check_finite, check_keys
 from warmprior.io.files import check_writable, exclusive
+from warmprior.io.progress import progress_bar
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
@@ -189,12 +189,8 @@ class PriorSpaceTraining:
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
-            tqdm(
-                total=config.environment_steps,
-                initial=self.steps,
-                desc=self.description,
-                unit="step",
-                **given(disable=self.description is None or None),  # given, it would overrule TQDM_DISABLE
+            progress_bar(
+                self.description, total=config.environment_steps, initial=self.steps, unit="step"
             ) as bar,
         ):
             self.decoder.check_env(evaluation_env)

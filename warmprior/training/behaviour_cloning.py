@@ -12,11 +12,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
-from tqdm import tqdm
 
-from warmprior.checks import given
 from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import check_writable, exclusive
+from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
@@ -204,13 +203,8 @@ class BehaviourCloning:
             self._keep()
         save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
         self.actor.train()
-        bar = tqdm(
-            total=config.iterations,
-            initial=self.iteration,
-            desc=description,
-            unit="it",
-            dynamic_ncols=True,
-            **given(disable=description is None or None),  # given, it would overrule TQDM_DISABLE
+        bar = progress_bar(
+            description, total=config.iterations, initial=self.iteration, unit="it", dynamic_ncols=True
         )
         self._logged = self.iteration, time.monotonic()
         report = progress or (lambda iteration: None)

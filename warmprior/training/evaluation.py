@@ -15,10 +15,10 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import ActionScaling, ObservationNorm
-from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers, given
+from warmprior.checks import check_whole_numbers
+from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of
@@ -248,8 +248,7 @@ def evaluate(
     if env.batch_size:
         played = _play_batched(policy, env, seeds, **options)
     outcomes: list[Episode] = []
-    hidden = given(disable=description is None or None)  # given, it would overrule TQDM_DISABLE
-    with tqdm(played, description, episodes, unit="ep", **hidden) as bar:
+    with progress_bar(description, played, total=episodes, unit="ep") as bar:
         for outcome in bar:
             outcomes.append(outcome)
             wins = sum(outcome.success for outcome in outcomes)
