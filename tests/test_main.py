@@ -88,6 +88,7 @@ def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
 
 
 def test_a_video_is_refused_before_the_episodes_where_nothing_renders(saved, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("av")
     monkeypatch.setattr("warmprior.envs.rendering.rendering_backend", lambda: None)
     argv = ["evaluate", str(saved[0]), "--episodes", "1", "--video", str(tmp_path / "out.mp4")]
     assert main(argv) == 2

@@ -162,7 +162,8 @@ def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame
     rows["gain"] = (rows["success"] - first_rows["success"]).where(other)
     deviations = [part.get("success_std", math.nan) for part in (rows, first_rows)]
     rows["one_sigma"] = rows["gain"] > deviations[0] + deviations[1]
-    pairs = rows[["successes", "episodes"]].join(first_rows[["successes", "episodes"]], rsuffix="_first")
+    counted = ["successes", "episodes"]
+    pairs = rows[counted].join(first_rows[counted].add_suffix("_first"))
     rows["better"] = [
         probability_better(*counts) if not math.isnan(gain) else math.nan
         for counts, gain in zip(pairs.to_numpy(), rows["gain"], strict=True)
@@ -229,7 +230,7 @@ def wide(rows: DataFrame, texts: Series, index: str, columns: str) -> DataFrame:
     """Return a pivot of texts in the order of the rows, with the largest NFE first."""
     rows = rows.assign(entry=texts).sort_values("nfe", ascending=False, kind="stable")
     order = rows[columns].unique()
-    pivot = rows.pivot(index=index, columns=columns, values="entry")
+    pivot = rows.pivot(index=index, columns=columns, values="entry").astype(object)
     return pivot.reindex(index=pd.unique(rows.sort_index()[index]), columns=order).fillna("-")
 
 

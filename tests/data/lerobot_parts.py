@@ -2,10 +2,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
+import pytest
 
 from warmprior.data.convert import quietly
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
 
 WIDTHS = {"observation.environment_state": 10, "observation.state": 9, "action": 7}
 """Those of lift."""

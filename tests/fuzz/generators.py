@@ -9,8 +9,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pytest
 import torch
-from pyarrow import parquet
 from tensordict import TensorDict
 
 from lab.options import Options, with_parts
@@ -36,6 +36,8 @@ from warmprior.envs import modernize_env_args
 from warmprior.history import cold_history
 from warmprior.training.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.training.saved import load_policy, policy_config, save_policy
+
+parquet = pytest.importorskip("pyarrow.parquet")
 
 Case = tuple[str, Callable[[], Outcome], str]
 """How a file was damaged, the load to attempt, and what its error has to name."""

@@ -61,6 +61,7 @@ class DrawnDial(Dial):
 
 
 def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypatch):
+    av = pytest.importorskip("av")
     gymnasium.register("DrawnDial-v0", DrawnDial, max_episode_steps=4)
     monkeypatch.setitem(gymnasium.registry, "DrawnDial-v0", gymnasium.registry.pop("DrawnDial-v0"))
     recorded = {"id": "DrawnDial-v0", "kwargs": {"render_mode": "human"}, "max_episode_steps": 4}
@@ -70,7 +71,6 @@ def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypa
     video = tmp_path / "video.mp4"
     strip = record_filmstrip(actor, seed=0, frames=9, size=16, video=video, terminate_on_success=False)
     assert [int(frame[0, 0, 0]) for frame in strip.frames] == strip.steps == [0, 1, 2, 3, 4]
-    av = pytest.importorskip("av")
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         assert (stream.average_rate, stream.frames) == (5, 5)
