@@ -1,15 +1,14 @@
-"""Histories against lists of executed actions, and the paper's equations 2 to 4 of them."""
+"""Histories against lists of executed actions, and the paper's equations 2 and 4 of them."""
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict
 
 from tests.errors import raises
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
-from warmprior.history import ENTRIES, advance, check_history, cold_history, window_history, without
+from warmprior.history import ENTRIES, advance, check_history, cold_history, without
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 
@@ -18,7 +17,7 @@ class Robot:
     """One row's executed actions and last chunk, as Python's own lists."""
 
     def __init__(self):
-        self.executed, self.left, self.reach = [], [], 0
+        self.executed, self.left = [], []
 
     def decide(self, chunk, k):
         self.executed += list(chunk[:k])
@@ -81,39 +80,6 @@ def test_precisions_stay_those_of_the_history(dtype, given_dtype):
     assert torch.equal(after["forecast"][0, :3], chunk[0, 1:].to(dtype))
 
 
-@given(
-    chunk_length=st.integers(1, 4),
-    further=st.integers(0, 5),
-    longer=st.integers(0, 3),
-    frame=st.integers(0, 9),
-    seed=st.integers(0, 10**6),
-)
-def test_a_window_is_a_perfect_forecast_of_which_a_chunk_was_executed(
-    chunk_length, further, longer, frame, seed
-):
-    """Eq. 3: as if the policy had said all along what is executed."""
-    length, remembered = chunk_length + further, chunk_length + longer
-    actions = torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
-    before = torch.cat([torch.zeros(remembered, 2), actions])[frame : frame + remembered]
-    target, steps = actions[frame : frame + length], torch.tensor([frame])
-    window = window_history(before, steps, target, chunk_length)
-    robot = Robot()
-    robot.decide(actions[:frame], frame)
-    expected = robot.history(remembered, length)
-    expected["forecast"] = torch.cat([target[:further], torch.zeros(chunk_length, 2)])
-    expected["forecast_steps"] = torch.tensor([further])
-    assert_equal(window, expected)
-    # Nothing of the rest of the target is in there.
-    other = torch.cat([target[:further], torch.randn(chunk_length, 2)])
-    assert_equal(window_history(before, steps, other, chunk_length), expected)
-    if frame >= chunk_length:
-        robot, start = Robot(), frame - chunk_length
-        robot.decide(actions[:start], start)
-        history = TensorDict(robot.history(remembered, length))
-        deployed = advance(history, actions[start:][:length], torch.tensor([chunk_length]))
-        assert_equal(deployed, expected)
-
-
 def test_withheld_rows_are_those_of_robots_that_did_nothing():
     history = random_history(PreviewPrior(3), 2, 4, cold=0.0)
     rows = torch.rand(2, 4) < 0.5
@@ -129,7 +95,7 @@ def equation(prior, robot, decided):
     horizon, length = prior.chunk_length, prior.prediction_length
     if isinstance(prior, PastPrior):  # Eq. 2
         return robot.executed[-horizon:] if len(robot.executed) >= horizon else [None] * length
-    if isinstance(prior, PreviewPrior) and decided:  # Eq. 3 in windows, Eq. 4 at decisions
+    if isinstance(prior, PreviewPrior) and decided:  # Eq. 4
         return robot.left[:horizon] + [None] * (length - horizon)
     return [None] * length
 
@@ -160,19 +126,6 @@ def test_means_at_decisions_are_equations_2_and_4(horizon, executed, prior_class
         history = advance(history, chunk, torch.tensor(k)[:, None])
         for row, robot in enumerate(robots):
             robot.decide(chunk[row], k[row])
-
-
-@pytest.mark.parametrize("prior_class", PRIORS)
-@pytest.mark.parametrize("horizon", [1, 3])
-def test_means_in_windows_are_equations_2_and_3(prior_class, horizon):
-    prior, actions = prior_class(horizon), torch.randn(20, 2)
-    padded = torch.cat([torch.zeros(horizon, 2), actions])
-    for frame in range(8):
-        target = actions[frame : frame + prior.prediction_length]
-        before, robot = padded[frame : frame + horizon], Robot()
-        robot.decide(actions, frame)
-        history = window_history(before, torch.tensor([frame]), target, horizon)
-        assert_mean(prior.distribution(history), prior, equation(prior, robot, True))
 
 
 def test_histories_that_cannot_be():
