@@ -64,15 +64,6 @@ def test_keys_and_shapes(shape):
     assert actor_for(prior, guidance=RealTimeChunking()).in_keys == [*actor.in_keys, keys.DELAY]
 
 
-def test_same_generator_same_chunks():
-    prior = PastPrior(H)
-    data, results = batch(prior, 4), []
-    for seed in (3, 3, 4):
-        actor = actor_for(prior, nfe=2, generator=torch.Generator().manual_seed(seed))
-        results.append(actor(data.clone())["vla_action", "chunk"])
-    assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
-
-
 def test_a_start_point_enters_the_flow_on_the_way():
     prior = GaussianPrior(H)
     actor = actor_for(prior, start=Halfway(), nfe=2)

@@ -18,34 +18,6 @@ def test_lengths_and_default_sigma(prior_class, horizon):
     assert (prior.sigma, prior.correlation) == (SIGMA[prior.name], 0.0)
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5, 2.0])
-@pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
-def test_sample_is_equation_one(prior_class, sigma):
-    prior = prior_class(3, sigma=sigma)
-    history = random_history(prior, 50)
-    source = prior.distribution(history)
-    loc, warm = source.loc, source.warm
-    assert warm.any() and not warm.all()
-    a0 = prior.sample(history, generator=torch.Generator().manual_seed(3))
-    eps = torch.randn(loc.shape, generator=torch.Generator().manual_seed(3))
-    for i in range(50):
-        for tau in range(prior.prediction_length):
-            expected = loc[i, tau] + sigma * eps[i, tau] if warm[i, tau] else eps[i, tau]
-            torch.testing.assert_close(a0[i, tau], expected)
-    same = prior.distribution(history).sample(torch.Generator().manual_seed(3))
-    assert torch.equal(a0, same)
-
-
-def test_the_gaussian_source_is_the_usual_one():
-    """To the bit, whatever the history."""
-    prior = GaussianPrior(3)
-    source = prior.distribution(random_history(prior, 5, cold=0.0))
-    loc, scale, warm = source.loc, source.scale, source.warm
-    assert not loc.any() and not warm.any() and (scale == 1).all()
-    a0 = prior.sample(random_history(prior, 5), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(a0, torch.randn(5, 3, 2, generator=torch.Generator().manual_seed(0)))
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
 def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlation):
     """Variance ``sigma^2``; covariance ``c sigma^2`` between warm positions of one dimension alone."""
