@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.modules.test_ode import STAGES, Counting, batch
+from tests.modules.test_ode import STAGES, Watched, batch
 from warmprior import ODEActor, integrate
 
 JUMPS = ["dense-jump", "dense-jump:0.8"]
@@ -25,13 +25,14 @@ def test_dense_jump_by_hand():
 
 @pytest.mark.parametrize("solver", STAGES)
 @pytest.mark.parametrize("start_time", [0.0, 0.3])
-def test_times_of_every_solver(solver, start_time):
+@pytest.mark.parametrize("grid", ["uniform", "dense-jump"])
+def test_times_of_every_solver(solver, start_time, grid):
     nodes = {"euler": (0.0,), "midpoint": (0, 0.5), "heun": (0, 1), "rk4": (0, 0.5, 0.5, 1)}[solver]
-    network = Counting()
-    options = {"solver": solver, "grid": "dense-jump", "start_time": start_time}
+    network = Watched()
+    options = {"solver": solver, "grid": grid, "start_time": start_time}
     ODEActor(network, nfe=4 * STAGES[solver], **options)(batch(5))
-    half = start_time + 0.5 * (1 - start_time)
-    points = [start_time + (half - start_time) * k / 3 for k in range(4)] + [1.0]
+    shares = [k / 4 if grid == "uniform" else k / 6 for k in range(4)]
+    points = [start_time + share * (1 - start_time) for share in (*shares, 1.0)]
     expected = [b + node * (e - b) for b, e in pairwise(points) for node in nodes]
     assert network.times == pytest.approx(expected, abs=1e-6)
 
@@ -59,6 +60,6 @@ def test_linear_fields_are_solved_on_every_grid(grid, start_time):
 @pytest.mark.parametrize("grid", ["dense", "dense-jump:0", "dense-jump:half"])
 def test_bad_grids(grid):
     with raises(ValueError, f"'{grid}'"):
-        ODEActor(Counting(), grid=grid)
+        ODEActor(Watched(), grid=grid)
     with raises(ValueError, f"'{grid}'"):
         integrate(lambda t, a: a, torch.ones(1, 1), nfe=1, grid=grid)
