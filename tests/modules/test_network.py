@@ -24,14 +24,19 @@ class Linear(VelocityNetwork):
         return self.norm(self.layer(a + self.position))
 
 
+SMALL = {"embedding_dim": 12, "num_layers": 1, "num_heads": 3}
+
+
 @pytest.mark.parametrize(
     "network",
     [
         Linear(2, 3, 4, k=5),
         VelocityMLP(2, 3, 4, 1, hidden_dim=16, num_blocks=2, timestep_embedding_dim=8),
         PlainMLP(2, 3, 4, 1, hidden_dim=16),
-        ChiTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3, dropout=0.0),
-        AdaLNTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3),
+        ChiTransformer(2, 3, 4, **SMALL, dropout=0.0),
+        ChiTransformer(2, 3, 4, **SMALL, observation_layers=2, time_frequency=1e-4),
+        AdaLNTransformer(2, 3, 4, **SMALL),
+        AdaLNTransformer(2, 3, 4, **SMALL, observation_layers=2, time_frequency=1e-4),
     ],
     ids=lambda network: type(network).__name__,
 )
