@@ -24,7 +24,6 @@ from warmprior import (
     GaussianPrior,
     Normalizer,
     PastPrior,
-    PreviewPrior,
     PriorAnchor,
     PriorDecoder,
     ResidualSampler,
@@ -105,16 +104,6 @@ def actor_for(prior=PRIOR):
     return WarmPriorActor(Recorder(), prior, nfe=2)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
-def test_every_episode_once(num_envs):
-    with closing(environments(num_envs)) as env:
-        for episodes in (1, 3, 7):
-            actor = actor_for()
-            result = evaluate(actor, env, episodes=episodes, first_seed=100)
-            assert result == expected(100, episodes)
-            assert set(range(100, 100 + episodes)) <= actor.network.seen
-
-
 class NoiseSuccess(SeededEnv):
     """Success depends on what the policy does, and so on its random numbers."""
 
@@ -136,15 +125,6 @@ def single(make_env=PlainEnv, prior=PRIOR):
 
 def chunks_of(episodes):
     return torch.cat([episode.decisions["vla_action", "chunk"] for episode in episodes])
-
-
-@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
-def test_a_single_environment_plays_every_seed_exactly_once(prior_class, tmp_path):
-    log = tmp_path / "resets"
-    prior = prior_class(H)
-    env = single(partial(PlainEnv, log=log), prior)
-    assert evaluate(actor_for(prior), env, episodes=7, first_seed=40) == expected(40, 7)
-    assert [int(line) for line in log.read_text().split()] == list(range(40, 47))
 
 
 def test_an_episode_depends_on_its_seeds_alone():
@@ -302,18 +282,27 @@ def batched(kind, make_env, num_envs, transforms_inside=False):
     return TransformedEnv(kind(num_envs, make_env, **options), policy_transforms(PRIOR))
 
 
-@pytest.mark.parametrize(("kind", "inside"), [(SerialEnv, False), (ParallelEnv, True)])
-def test_any_batched_environment_plays_every_seed_once(kind, inside, tmp_path):
-    log = tmp_path / "resets"
-    with closing(batched(kind, partial(PlainEnv, log=log), 3, inside)) as env:
-        actor = actor_for()
-        for first, episodes in ((40, 7), (5, 2)):
+PLACES = {
+    "one worker": lambda log: environments(1, log=log),
+    "workers": lambda log: environments(3, log=log),
+    "single": lambda log: single(partial(PlainEnv, log=log)),
+    "transforms outside": lambda log: batched(SerialEnv, partial(PlainEnv, log=log), 3),
+    "transforms inside": lambda log: batched(ParallelEnv, partial(PlainEnv, log=log), 3, True),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_every_episode_once(place, tmp_path):
+    log, actor = tmp_path / "resets", actor_for()
+    with closing(PLACES[place](log)) as env:
+        for first, episodes in ((40, 7), (5, 2), (60, 3), (80, 1)):
             before = len(log.read_text().split()) if log.exists() else 0
             result = evaluate(actor, env, episodes=episodes, first_seed=first)
             assert result == expected(first, episodes)
-            assert set(range(first, first + episodes)) <= actor.network.seen
+            seeds = range(first, first + episodes)
             played = [int(line) for line in log.read_text().split()][before:]
-            assert set(range(first, first + episodes)) <= set(played)
+            assert set(seeds) <= actor.network.seen and set(seeds) <= set(played)
+            assert place != "single" or played == list(seeds)
 
 
 @pytest.mark.parametrize("form", ["partial", "nested", "keywords"])
