@@ -70,20 +70,6 @@ def test_returns_in_closed_form(lengths, horizon, data, gamma, truncate):
     env.close()
 
 
-def test_partial_reset_and_step():
-    base = SerialEnv(2, [partial(CountingEnv, n) for n in (3, 9)])
-    env = TransformedEnv(base, ChunkStep(3))
-    data = env.step(ones(3)(env.reset()))
-    assert data["next", "done"].flatten().tolist() == [True, False]
-    after = env.step_mdp(data)
-    after = env.reset(after.set("_reset", data["next", "done"]))
-    assert after["observation"][:, 0].tolist() == [0, 3]
-    after["_step"] = torch.tensor([False, True])
-    stepped = env.step(ones(3)(after))["next"]
-    assert stepped["observation"][:, 0].tolist() == [0, 6]
-    assert stepped["executed_steps"].flatten().tolist() == [0, 3]
-
-
 def test_rows_that_rest_count_for_no_measure():
     env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 9)), ChunkStep(3, measures={"observation": "sum"}))
     data = env.step_mdp(env.step(ones(3)(env.reset())))

@@ -2,33 +2,13 @@
 
 from functools import partial
 
-import pytest
 import torch
-from torchrl.envs import CatFrames, Compose, SerialEnv, TransformedEnv, UnsqueezeTransform
+from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
 from tests.toy_env import CountingEnv
 from warmprior import ObservationStack
-
-
-@pytest.mark.parametrize("steps", [1, 2, 4])
-def test_equals_cat_frames_on_a_single_environment(steps):
-    ours = TransformedEnv(CountingEnv(6), ObservationStack(steps))
-    theirs = TransformedEnv(
-        CountingEnv(6),
-        Compose(
-            UnsqueezeTransform(-2, in_keys=["observation"]), CatFrames(steps, dim=-2, in_keys=["observation"])
-        ),
-    )
-    check_env_specs(ours)
-    theirs.base_env.episode = ours.base_env.episode
-    torch.manual_seed(0)
-    one = ours.rollout(15, break_when_any_done=False)
-    torch.manual_seed(0)
-    two = theirs.rollout(15, break_when_any_done=False)
-    assert torch.equal(one["observation"], two["observation"])
-    assert torch.equal(one["next", "observation"], two["next", "observation"])
 
 
 def test_rows_that_reset_or_rest_alone():
