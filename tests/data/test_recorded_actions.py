@@ -36,23 +36,20 @@ def write(path, kind="scripted", stored="delta", task="lift", lengths=(40, 25), 
     arms = 2 if task == "transport" else 1
     with h5py.File(path, "a") as file:
         for number, steps in enumerate(lengths):
-            demo, columns = (
-                file[f"data/demo_{number}"],
-                {"delta": [], "absolute": [], "rotvec": [], "base": []},
-            )
+            demo = file[f"data/demo_{number}"]
+            columns = {"delta": [], "absolute": [], "rotvec": [], "base": []}
             for arm in range(arms):
-                move, turn = _deltas(kind, steps, rng), np.clip(rng.normal(size=(steps, 3)), -1, 1)
+                move, turn = _deltas(kind, steps, rng), rng.normal(size=(steps, 3))
                 gripper = rng.choice([-1.0, 1.0], size=(steps, 1))
-                # The hand points down and lags behind what it is asked for.
+                # The hand points down and lags behind what it is asked for; the controller clips that.
                 start = np.array([0.0, 0.1 - 0.2 * arm, 1.0]) + 0.1 * rng.normal(size=3)
                 clipped = 0.05 * np.clip(move, -1, 1)
                 place = start + np.concatenate([np.zeros((1, 3)), 0.5 * clipped.cumsum(0)[:-1]])
-                hand = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(
-                    0.1 * rng.normal(size=(steps, 3))
-                )
+                tilt = Rotation.from_rotvec(0.1 * rng.normal(size=(steps, 3)))
+                hand = Rotation.from_rotvec([np.pi, 0, 0]) * tilt
                 demo[f"obs/robot{arm}_eef_pos"][...] = place
                 demo[f"obs/robot{arm}_eef_quat"][...] = hand.as_quat()
-                site = Rotation.from_rotvec(0.5 * turn) * hand * HAND_TO_SITE
+                site = Rotation.from_rotvec(0.5 * np.clip(turn, -1, 1)) * hand * HAND_TO_SITE
                 rows = site.as_matrix()[:, :2].reshape(steps, 6)
                 columns["delta"] += [move, turn, gripper]
                 columns["absolute"] += [place + clipped, rows, gripper]

@@ -51,31 +51,6 @@ def test_quaternions_against_scipy():
     np.testing.assert_allclose(quaternion_to_matrix(torch.from_numpy(-3 * quaternions)), expected, atol=1e-12)
 
 
-def _reference(actions, position, quaternion, base=None):
-    """One arm, with scipy: [N, 7] deltas to positions, rotations and grippers."""
-    base = base or Rotation.identity()
-    delta = np.clip(actions[:, :6], -1, 1)
-    goal = position + base.apply(0.05 * delta[:, :3])
-    turn = base * Rotation.from_rotvec(0.5 * delta[:, 3:]) * base.inv()
-    return goal, turn * Rotation.from_quat(quaternion) * SITE, actions[:, 6:]
-
-
-@pytest.mark.parametrize("arms", [1, 2])
-def test_absolute_actions_against_scipy(arms):
-    rng = np.random.default_rng(arms)
-    n = 40
-    actions = rng.uniform(-1.5, 1.5, (n, 7 * arms))  # beyond the limits: the controller clips
-    position = rng.normal(size=(n, 3 * arms))
-    quaternion = np.concatenate([_quaternions(n, seed) for seed in range(arms)], -1)
-    out = absolute_actions(*map(torch.from_numpy, (actions, position, quaternion)))
-    assert out.shape == (n, 10 * arms)
-    of_arms = (np.split(values, arms, -1) for values in (out.numpy(), actions, position, quaternion))
-    for found, *parts in zip(*of_arms, strict=True):
-        goal, rotation, gripper = _reference(*parts)
-        rows = rotation.as_matrix()[:, :2].reshape(n, 6)
-        np.testing.assert_allclose(found, np.concatenate([goal, rows, gripper], -1), atol=1e-9)
-
-
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("make", [env_args_14, env_args_15])
 def test_modernize_is_pure_and_idempotent(task, make):
