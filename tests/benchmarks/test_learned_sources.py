@@ -8,10 +8,9 @@ from lab.learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStar
 from tests.errors import raises
 from tests.states import same
 from tests.toy_env import random_history
-from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, window_transforms
+from warmprior import GaussianPrior, window_transforms
 from warmprior.modules import Prior
 from warmprior.modules.registry import from_config
-from warmprior.training import load_policy, save_policy
 
 H, D_A, D_O = 2, 1, 2
 NOISE = 0.3
@@ -172,22 +171,6 @@ def test_step_starts_on_the_path_to_the_forecast_and_a_robot_that_stays_meets_mo
     history["steps"][2] = H - 1  # too few to say that it stays
     factor = torch.tensor([1.5, 1.0, 1.0])[:, None, None]
     torch.testing.assert_close(start(noise, history, None), 0.25 * factor * noise + 0.75 * 0.4)
-
-
-def test_an_actor_integrates_from_there_and_is_saved_with_it(tmp_path):
-    torch.manual_seed(0)
-    start, prior = built(ForecastStart, start_time=0.5), GaussianPrior(H)
-    network = VelocityMLP(D_A, D_O, H, 1, hidden_dim=8)
-    save_policy(WarmPriorActor(network, prior, start=start, nfe=2).eval(), tmp_path)
-    history = random_history(prior, 3, action_dim=D_A)
-    data = TensorDict({"observation": torch.rand(3, 1, D_O), "history": history}, [3])
-    out = load_policy(tmp_path)(data.clone(), generator=torch.Generator().manual_seed(0))
-    noise = torch.randn(3, H, D_A, generator=torch.Generator().manual_seed(0))
-    a = start(noise, history, data["observation"])
-    assert torch.equal(out["prior", "noise"], a)
-    for t in (0.5, 0.75):
-        a = a + 0.25 * network(torch.full((3,), t), a, data["observation"])
-    torch.testing.assert_close(out["vla_action", "chunk"], a)
 
 
 def test_the_same_seed_learns_the_same_and_leaves_other_draws_alone(data):
