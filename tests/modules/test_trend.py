@@ -148,9 +148,13 @@ def test_a_cast_trend_keeps_its_units(dtype):
     assert {part.dtype for part in trend(normalised.to(dtype).unsqueeze(1))} == {dtype}
 
 
-def test_config_and_state_bring_it_back():
+JOINTS = [1, 2, -1, 0, 3, 4, 5, 6, 7, -1]
+
+
+@pytest.mark.parametrize("rest", [RestingPose(COLUMNS, normalizer()), RestingJoints(JOINTS, normalizer())])
+def test_config_and_state_bring_it_back(rest):
     batch, prior = windows(200), GaussianPrior(P)
-    trend = PoseTrend.fit(batch, prior, RestingPose(COLUMNS, normalizer()))
+    trend = PoseTrend.fit(batch, prior, rest)
     moments = SourceMoments.fit(batch, prior, trend=trend)
     mlp = VelocityMLP(D_A, D_O, P, TO, hidden_dim=8)
     network = PreconditionedNetwork(mlp, moments=moments, trend=trend)

@@ -150,15 +150,6 @@ def test_a_network_that_cannot_be_compiled_is_refused_in_one_sentence(tmp_path, 
         cloning.step()
 
 
-def test_a_finished_training_stays_as_it_is(tmp_path):
-    first = finished(tmp_path)
-    before = (tmp_path / "state.safetensors").read_bytes()
-    again = finished(tmp_path)
-    assert again.iteration == 40 and again.losses == first.losses
-    assert same(weights(again), weights(first))
-    assert (tmp_path / "state.safetensors").read_bytes() == before
-
-
 def killed_training(folder, iterations):
     config = dataclasses.replace(CONFIG, iterations=iterations, save_every=3, checkpoints=5)
     return training(folder, config)
