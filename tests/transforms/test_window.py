@@ -74,20 +74,6 @@ def test_random_episodes(lengths, horizon, further, longer, observation_steps, n
     check(window(every_step(data)), data, window)
 
 
-def test_generator_fixes_steps_and_what_is_withheld():
-    data = steps([20, 30])
-
-    def draw(seed):
-        generator = torch.Generator().manual_seed(seed)
-        buffer = window_replay_buffer(data, PastPrior(2), batch_size=50, withhold=0.5, generator=generator)
-        return torch.cat([buffer.sample() for _ in range(3)])
-
-    one, same, other = draw(1), draw(1), draw(2)
-    assert torch.equal(one["frame"], same["frame"])
-    assert (one["history"] == same["history"]).all()
-    assert not torch.equal(one["frame"], other["frame"])
-
-
 def test_without_withholding_nothing_is_drawn_but_the_steps():
     """The generator's stream is that of Algorithm 1."""
     streams = []
