@@ -1,5 +1,6 @@
 """What is released installs into an empty environment, and runs there."""
 
+import json
 import os
 import re
 import subprocess
@@ -148,4 +149,5 @@ def test_the_plugin_trains_and_plays_with_the_wheels_alone(python, tmp_path):
     write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
     run(python, "-m", "lerobot.scripts.lerobot_train", *TRAIN.split(), cwd=tmp_path)
     run(python, "-m", "lerobot.scripts.lerobot_eval", *EVALUATE.split(), cwd=tmp_path)
-    assert (tmp_path / "evaluation" / "eval_info.json").is_file()
+    results = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
+    assert results["overall"]["n_episodes"] == 1

@@ -34,19 +34,26 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
         read_index(path, demos=0)
 
 
-def test_unknown_environment_uses_what_it_finds(tmp_path):
+def test_an_unknown_environment_has_what_it_finds(tmp_path):
+    """Also a goal by a name of its own: a policy that is blind to it would learn nothing, without a word."""
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path, task="transport", env_args=env_args_15("lift") | {"env_name": "Own"})
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
+            steps = len(demo["actions"])
             del demo["obs/robot1_eef_quat"]
+            demo["obs/goal"] = np.full((steps, 2), 0.25)
+            demo["obs/door_open"] = np.zeros(steps, bool)
+            demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
+            demo["obs/language"] = np.array([b"open"] * steps)
+            demo.create_group("obs/nested")
     index = read_index(path)
     assert index.task is None and index.action_dim == 14
     assert index.observation_keys == (
         *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
-        *("robot1_eef_pos", "robot1_gripper_qpos"),
+        *("robot1_eef_pos", "robot1_gripper_qpos", "door_open", "goal"),
     )
-
+    assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
     for nothing in [], ():
         with raises(DatasetError, "file.hdf5", "observation_keys", "robot0_eef_pos"):
             read_index(path, observation_keys=nothing)
@@ -56,25 +63,6 @@ def test_a_file_of_another_simulator_is_read_without_its_environment(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path, env_args={"env_name": "Isaac-Lift-v0", "type": 2})
     assert read_index(path).env_args == {}
-
-
-def test_unknown_environment_keeps_what_is_no_robots(tmp_path):
-    """A goal by a name of its own: a policy that is blind to it would learn nothing, without a word."""
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, env_args=env_args_15("lift") | {"env_name": "Own"})
-    with h5py.File(path, "a") as file:
-        for demo in file["data"].values():
-            steps = len(demo["actions"])
-            demo["obs/goal"] = np.full((steps, 2), 0.25)
-            demo["obs/door_open"] = np.zeros(steps, bool)
-            demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
-            demo["obs/language"] = np.array([b"open"] * steps)
-            demo.create_group("obs/nested")
-    index = read_index(path)
-    assert index.observation_keys == (
-        *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "door_open", "goal"),
-    )
-    assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
 
 
 def test_files_without_rewards(tmp_path):

@@ -103,27 +103,21 @@ def test_cameras_whose_names_end_alike_are_told_apart(tmp_path):
     assert list(index.images.values()) == cameras
 
 
-@pytest.mark.parametrize("kind", ["reward", "success"])
-def test_rewards_are_those_of_the_dataset(tmp_path, kind):
-    feature = numbers(1) if kind == "reward" else {"dtype": "bool", "shape": (1,), "names": None}
-    features = {name: numbers(w) for name, w in WIDTHS.items()} | {f"next.{kind}": feature}
-    values = write_lerobot(tmp_path / "data", features=features)[f"next.{kind}"]
-    data = LeRobotDemonstrations(tmp_path / "data").data
-    np.testing.assert_array_equal(data["next", "reward"].numpy(), values.astype(np.float32))
-    last = torch.tensor([5, 6, 15])
-    won = torch.from_numpy(values > 0)[last]
-    assert torch.equal(data["next", "terminated"][last], won)
+KINDS = {"next.reward": numbers(1), "next.success": {"dtype": "bool", "shape": (1,), "names": None}}
 
 
-def test_recorded_success_and_no_shaped_reward_ends_an_episode(tmp_path):
-    success = {"next.success": {"dtype": "bool", "shape": (1,), "names": None}}
-    features = {name: numbers(w) for name, w in WIDTHS.items()} | {"next.reward": numbers(1)} | success
+@pytest.mark.parametrize("names", [["next.reward"], ["next.success"], [*KINDS]])
+def test_rewards_are_those_of_the_dataset_and_success_ends_an_episode(tmp_path, names):
+    """Recorded success tells the end, and no shaped reward beside it."""
+    features = {name: numbers(w) for name, w in WIDTHS.items()} | {name: KINDS[name] for name in names}
     values = write_lerobot(tmp_path / "data", (4, 3, 5, 2), features)
+    data = LeRobotDemonstrations(tmp_path / "data").data["next"]
+    np.testing.assert_array_equal(data["reward"].numpy(), values[names[0]].astype(np.float32))
     last = [3, 6, 11, 13]
-    data = LeRobotDemonstrations(tmp_path / "data").data[last]["next"]
-    assert data["terminated"].flatten().tolist() == values["next.success"][last].flatten().tolist()
-    assert torch.equal(data["truncated"], ~data["terminated"])
-    assert not np.array_equal(values["next.success"][last], values["next.reward"][last] > 0)
+    won = torch.from_numpy(values[names[-1]] > 0)[last]
+    assert torch.equal(data["terminated"][last], won) and torch.equal(data["truncated"][last], ~won)
+    if len(names) == 2:
+        assert not torch.equal(won, torch.from_numpy(values["next.reward"] > 0)[last])
 
 
 LAYOUTS = {

@@ -29,7 +29,7 @@ TREE = Dict(
         "front": Box(0, 255, (16, 16, 3), np.uint8),
     }
 )
-ACTION = Box(-1, 1, (1,), np.float32)
+ACTION, MATRIX = (Box(-1, 1, shape, np.float32) for shape in ((1,), (2, 2)))
 
 
 @pytest.fixture(autouse=True)
@@ -98,17 +98,15 @@ def test_entries_of_dictionaries_are_chosen_by_name():
 
 
 @pytest.mark.parametrize(
-    ("action", "fact"), [(Discrete(3), "Discrete"), (Box(-1, 1, (2, 2), np.float32), "(2, 2)")]
+    ("space", "facts"),
+    [
+        *(({"action": Discrete(3)}, ["Discrete"]), ({"action": MATRIX}, ["(2, 2)"])),
+        *(({"observation": o}, [str(o), "FlattenObservation"]) for o in (Discrete(4), MATRIX)),
+    ],
 )
-def test_actions_that_are_no_vector_are_refused(action, fact):
-    with raises(DatasetError, fact):
-        MinariDemonstrations(written(action=action))
-
-
-@pytest.mark.parametrize("observation", [Discrete(4), Box(-1, 1, (2, 2), np.float32)])
-def test_observations_without_a_vector_are_refused(observation):
-    with raises(DatasetError, str(observation), "FlattenObservation"):
-        MinariDemonstrations(written(observation=observation))
+def test_what_is_no_vector_is_refused(space, facts):
+    with raises(DatasetError, *facts):
+        MinariDemonstrations(written(**space))
 
 
 def test_what_there_is_not(root):

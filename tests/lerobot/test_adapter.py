@@ -21,20 +21,6 @@ def started(adapter, family, policy, batch, steps):
     return torch.stack(actions, 1), sources
 
 
-@pytest.mark.parametrize("every", [3, LENGTH])
-def test_the_past_is_what_was_executed(policy, built, every):
-    made = policy("pi05") if every == LENGTH else built("pi05", n_action_steps=every)
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
-    actions, sources = started(adapter, "pi05", made, observations("pi05", 2), 3 * LENGTH)
-    assert len(sources) == -(-3 * LENGTH // every)
-    for decision, source in enumerate(sources):
-        now = decision * every
-        if now >= LENGTH:
-            assert torch.equal(source, actions[:, now - LENGTH : now])
-        else:
-            assert not torch.equal(source[:, -now:], actions[:, :now]) or now == 0
-
-
 def test_the_preview_is_the_last_forecast(built):
     every, half = 3, LENGTH // 2
     made = built("smolvla", n_action_steps=every)

@@ -1,15 +1,10 @@
 import dataclasses
 import importlib
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-from tests.data.lerobot_parts import write_lerobot
 from tests.errors import raises
 from tests.lerobot.plugin_policies import VLA, flow_batch, flow_policy, small, warm
 from tests.lerobot.seen import watch
@@ -130,34 +125,6 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     before.steps[2].modality_config = {"action": {"action_configs": [{"rep": "relative"}]}}
     with raises(ValueError, "embodiment_tag"):
         before(dict(raw))
-
-
-TRAIN = """--policy.type=warm_flow --policy.embedding_dim=24 --policy.num_layers=1 --policy.device=cpu
---policy.push_to_hub=false --steps=2 --batch_size=4 --num_workers=0 --save_freq=2"""
-
-
-@pytest.mark.slow
-def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
-    """The commands of the documentation, offline."""
-    pytest.importorskip("robosuite")
-    pytest.importorskip("accelerate")
-    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
-    scripts, options = Path(sys.executable).parent, os.environ | {"HF_HUB_OFFLINE": "1"}
-
-    def run(script, *argv):
-        command = [sys.executable, str(scripts / script), *argv]
-        done = subprocess.run(command, env=options, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
-
-    data = [f"--dataset.root={tmp_path / 'data'}", "--dataset.repo_id=local/tiny"]
-    run("lerobot-train", *data, *TRAIN.split(), f"--output_dir={tmp_path / 'run'}")
-    policy = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    environment = ["--env.type=warmprior_robosuite", "--env.task=lift", "--env.episode_length=20"]
-    episodes = ["--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu"]
-    out = f"--output_dir={tmp_path / 'evaluation'}"
-    run("lerobot-eval", f"--policy.path={policy}", *environment, *episodes, out)
-    results = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
-    assert results["overall"]["n_episodes"] == 1
 
 
 @pytest.mark.parametrize("name", [*VLA, "warm_flow"])
