@@ -98,14 +98,6 @@ def evaluation(options, **others):
     return {**found, "nfe": nfe, "chunk": options.sources.chunk, **others}
 
 
-def test_the_paper_says_the_same_twice():
-    """The rollouts of its violins (appendix A), and the two peaks of its study of sigma."""
-    assert facts.EVALUATION["episodes"] * facts.EVALUATION["seeds"] == 600
-    *_, past, preview = facts.SUCCESS["square", "mh", "state"]
-    assert past / 100 == pytest.approx(facts.SIGMA_SUCCESS["past", 0.5])
-    assert preview / 100 == pytest.approx(facts.SIGMA_SUCCESS["preview", 1.0])
-
-
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_recipe_from_the_state(name, monkeypatch):
     preset, usual = presets_of(name, monkeypatch)["paper"], facts.EVALUATION

@@ -107,22 +107,15 @@ def test_data_spread_against_loops(data):
     assert result[1].data_spread == pytest.approx(expected, rel=1e-4)
 
 
-def test_neighbours_come_from_other_episodes():
-    """Four episodes of slow observations, each with an action of its own: +1 or -1."""
-    episodes = torch.arange(4).repeat_interleave(20)
-    side = (episodes % 2 * 2.0 - 1)[:, None, None]
-    seen = torch.arange(20.0).repeat(4)[:, None, None] + 0.01 * side
-    data = batch(80, observation=seen, vla_action={"chunk": side.expand(80, H, D_A).clone()})
+def test_episodes_may_be_part_of_the_data():
+    data, episodes = windows(80), torch.arange(4).repeat_interleave(20)
     actor = policy(passing(0.5))
-    # The nearest episode agrees with the window, the other two do not.
-    assert source_leak(actor, data, episodes=episodes, nfes=(1,))[1].data_spread == 0.0
-    apart = episodes % 2  # as if the two that agree were one
-    disagree = source_leak(actor, data, episodes=apart, nfes=(1,))[1]
-    assert disagree.data_spread == pytest.approx(math.sqrt(4 / 2))
-    carried = data.clone().set("episode", apart)
-    assert source_leak(actor, carried, nfes=(1,))[1] == disagree
-    # Without episodes the other windows of one's own are neighbours, too.
+    given = source_leak(actor, data, episodes=episodes, nfes=(1,))[1]
+    assert source_leak(actor, data.clone().set("episode", episodes), nfes=(1,))[1] == given
+    # Without episodes the other windows of one's own are neighbours, too: these have the same actions.
     alone = data[:20].clone()
+    assert source_leak(actor, alone, nfes=(1,))[1].data_spread > 0
+    alone["vla_action", "chunk"][:] = 1.0
     assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
     with raises(ValueError, "episode"):
         source_leak(actor, alone, episodes=episodes[:20])

@@ -250,19 +250,10 @@ def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkey
 def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, monkeypatch, capsys):
     for room in ("data.images", "envs.rendering"):
         monkeypatch.setattr(f"warmprior.{room}.rendering_backend", lambda: None)
-    small = "--encoder small --crop-size 12 --network.hidden-dim 8 --iterations 1 --batch-size 2 --held-out 0"
-    small = small.replace("network.", "").split()
-    argv = [
-        "train",
-        str(picture),
-        "--image-keys",
-        *IMAGES,
-        "--fast-rendering",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    small = "--encoder small --crop-size 12 --hidden-dim 8 --iterations 1 --batch-size 2 --held-out 0"
+    argv = f"train {picture} --fast-rendering --out {tmp_path / 'out'} {small} --image-keys".split()
     with pytest.warns(UserWarning, match=picture.name):
-        assert main([*argv, *small]) == 0
+        assert main([*argv, *IMAGES]) == 0
     assert not missing(capsys.readouterr().out, "EGL", "only trained")
     assert list(tmp_path.glob("out/*/policy_000001/model.safetensors"))
 

@@ -81,13 +81,6 @@ def test_what_is_left_over_must_be_of_the_last_chunk(found):
         policy.predict_action_chunk(dict(batch), inference_delay=1, prev_chunk_left_over=chunk[:, 2:5])
 
 
-def test_lerobots_policy_server_knows_none_of_these():
-    """It tells a policy nothing of what was executed: the documentation says so."""
-    from lerobot.async_inference.constants import SUPPORTED_POLICIES
-
-    assert not {*VLA, "warm_flow"} & set(SUPPORTED_POLICIES)
-
-
 def test_more_executed_than_the_prior_remembers(policy):
     """As on a robot whose next chunk is late; the chunk has no more actions than the prior predicts."""
     from warmprior import PastPrior, PreviewPrior

@@ -6,15 +6,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
-from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
-from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, ends_of
-from warmprior import ActionHistory, ChunkStep
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from warmprior import ChunkStep
 
 
 def ones(length):
@@ -97,69 +95,26 @@ def test_bad_lengths():
                 ChunkStep(**{"chunk_length": 3, name: value})
 
 
-def test_collector_fills_a_replay_buffer():
-    """Decisions, discounts by executed steps and the next history come back out as they went in."""
-    base = SerialEnv(2, [partial(CountingEnv, n) for n in (7, 4)])
-    env = TransformedEnv(
-        base, Compose(StepCounter(), ChunkStep(3, gamma=0.9), ActionHistory(3), InitTracker())
-    )
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=500)
-    collector = Collector(env, ones(3), frames_per_batch=24, total_frames=96)
-    for batch in collector:
-        buffer.extend(batch.reshape(-1))
-    sample = buffer.sample()
-    start = sample["observation"][:, 0]
-    k = sample["next", "executed_steps"].squeeze(-1)
-    assert set(k.tolist()) == {1, 3}
-    expected = [geometric(0.9, int(s), int(n)) for s, n in zip(start, k, strict=True)]
-    torch.testing.assert_close(sample["next", "reward"].squeeze(-1), torch.tensor(expected))
-    whole = k == 3
-    torch.testing.assert_close(
-        sample["next", "history", "actions"][whole], sample["vla_action", "chunk"][whole]
-    )
-    assert (sample["history", "steps"].squeeze(-1) == start.clamp(max=3)).all()
-    collector.shutdown()
+class Paying(CountingEnv):
+    """Every step pays the same, which is one end of its bounds."""
 
-
-class VectorEnv(EnvBase):
-    """The toy for a batch at once, with rewards of any spec and shape; ignores which rows are asked."""
-
-    def __init__(self, reward_spec, done_after=(7, 4), reward=1.0, action_shape=(ACTION_DIM,)):
-        super().__init__(batch_size=[len(done_after)])
-        self.ends = torch.tensor(done_after)[:, None]
-        self.reward = reward
-        self.observation_spec = Composite(count=Unbounded((2, 1), dtype=torch.int64), shape=self.batch_size)
-        self.state_spec = self.observation_spec.clone()
-        self.action_spec = Bounded(-1, 1, (2, *action_shape))
-        self.reward_spec = reward_spec
-        self.done_spec = ends_of(2)
-
-    def _reset(self, tensordict=None, **kwargs):
-        count = torch.zeros(2, 1, dtype=torch.int64)
-        return TensorDict({"count": count}, [2]).update(self.full_done_spec.zero())
-
-    def _set_seed(self, seed):
-        """Nothing is random."""
+    def __init__(self, low, high, reward, length):
+        super().__init__(length)
+        self.reward_spec, self.reward = Bounded(low, high, (1,)), reward
 
     def _step(self, tensordict):
-        count = tensordict["count"] + 1
-        done = count >= self.ends
-        spec = self.full_reward_spec["reward"]
-        reward = torch.full(spec.shape, self.reward, dtype=spec.dtype)
-        out = TensorDict({"count": count, "done": done, "terminated": done, "reward": reward}, [2])
-        return out.set("truncated", torch.zeros_like(done))
+        return super()._step(tensordict).set("reward", torch.tensor([self.reward]))
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9, 0.0])
 @pytest.mark.parametrize(("low", "high", "reward"), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0), (-2.0, -1.0, -1.0)])
 def test_the_sum_may_leave_the_bounds_of_one_reward(low, high, reward, gamma):
-    base = VectorEnv(Bounded(low, high, (2, 1)), reward=reward)
+    base = SerialEnv(2, [partial(Paying, low, high, reward, n) for n in (8, 5)])
     env = TransformedEnv(base, ChunkStep(3, gamma=gamma))
     check_env_specs(env)
-    total = 1 + gamma + gamma**2
-    found = env.rollout(2)["next", "reward"]
-    torch.testing.assert_close(found[:, 0], torch.full((2, 1), reward * total))
-    torch.testing.assert_close(found[1, 1], torch.full((1,), reward))
+    two, three = 1 + gamma, 1 + gamma + gamma**2
+    found = env.rollout(2, ones(3))["next", "reward"].squeeze(-1)
+    torch.testing.assert_close(found, reward * torch.tensor([[three, three], [three, two]]))
     # The bounds that the wrapped environment gave are its own still.
     assert (base.full_reward_spec["reward"].space.high == high).all()
 
@@ -169,8 +124,10 @@ def test_what_no_chunk_can_be():
     for length in (2, 4):
         with raises(ValueError, "[*B, 3, d_a]", f"({length}, 2"):
             env.step(ones(length)(env.reset()))
-    with raises(ValueError, "'action'", "[*B, d_a]", "(2"):
-        TransformedEnv(VectorEnv(Unbounded((2, 1)), action_shape=()), ChunkStep(3)).rollout(1)
+    number = CountingEnv(5)
+    number.action_spec = Bounded(-1, 1, ())
+    with raises(ValueError, "'action'", "[*B, d_a]", "(2,)"):
+        TransformedEnv(SerialEnv(2, lambda: number), ChunkStep(3)).rollout(1)
     env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
     with raises(ValueError, "'reward'"):
         env.step(ones(2)(env.reset()))
