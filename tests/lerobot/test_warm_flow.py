@@ -6,14 +6,7 @@ from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.errors import raises
 from tests.lerobot.plugin_policies import flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
-from warmprior import (
-    HistoryObservation,
-    Normalizer,
-    PastPrior,
-    RealTimeChunking,
-    VelocityMLP,
-    keys,
-)
+from warmprior import HistoryObservation, Normalizer, PastPrior, RealTimeChunking, VelocityMLP, keys
 from warmprior.data import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
