@@ -1,4 +1,3 @@
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -75,33 +74,6 @@ def test_a_dead_process_ends_all_others(tmp_path):
         call(kill_oneself).result()
     assert isinstance(raised.value.__cause__, BrokenProcessPool)
     wait_for(lambda: all(map(ended, pids)), 20)
-
-
-def hold(folder, errors):
-    """What a script does that lets a process work."""
-    os.setsid()
-    os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT), 2)
-    sys.stderr = os.fdopen(2, "w", closefd=False)  # not pytest's
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start its background ignoring it
-    with working(1, None) as call:
-        call(partial(sleep, folder / "x")).result()
-
-
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_processes_end_with_whoever_started_them(tmp_path, how):
-    """However that ends; a terminal sends SIGINT to all of them."""
-    (tmp_path / "work").mkdir()
-    errors = tmp_path / "errors"
-    holder = multiprocessing.get_context("fork").Process(target=hold, args=(tmp_path / "work", errors))
-    holder.start()
-    pids = sleepers(tmp_path / "work", 1)
-    time.sleep(1.0)
-    assert not any(map(ended, pids))
-    os.killpg(holder.pid, how) if how == signal.SIGINT else holder.kill()
-    holder.join(60)
-    wait_for(lambda: all(map(ended, pids)), 20)
-    if how == signal.SIGINT:
-        assert errors.read_text().count("KeyboardInterrupt") == 1
 
 
 FAKED = """
