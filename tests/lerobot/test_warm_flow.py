@@ -25,25 +25,9 @@ def moments_for(policy, steps):
     return precondition(VelocityMLP(*sizes), steps, policy.actor.prior).moments.state_dict()
 
 
-def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
-    """By the moments that this library fits to the same steps; and its averaged weights play."""
-    from lerobot.datasets import LeRobotDatasetMetadata
-
-    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
-    meta = LeRobotDatasetMetadata("local/tiny", root=tmp_path / "data")
-    config = flow_policy(found).config
-    widths = {name: feature["shape"] for name, feature in meta.features.items()}
-    for name, feature in config.input_features.items():
-        feature.shape = tuple(widths[name])
-    config.output_features["action"].shape = tuple(widths["action"])
-    policy = found["warm_flow"](config, dataset_meta=meta)
-    steps = LeRobotDemonstrations(tmp_path / "data", observation_keys=config.observed).data
-    low, high = steps["action"].amin(0), steps["action"].amax(0)
-    normalised = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1
-    assert (normalised[:, -1] == -1).all()  # as LeRobot has what never changes
-    own = moments_for(policy, steps.set("action", normalised))
-    torch.testing.assert_close(policy.actor.network.moments.state_dict(), own)
-    before = [weight.clone() for weight in policy.averaged.module.parameters()]
+def test_the_average_follows_the_weights(found):
+    policy = flow_policy(found)
+    before = [weight.clone() for weight in policy.actor.network.parameters()]
     policy.update()  # the first one copies
     with torch.no_grad():
         for weight in policy.actor.network.parameters():
@@ -65,21 +49,25 @@ def dataset_policy(found, root, episodes=None, place=None, **options):
 
 
 def moments_by_hand(policy, dataset, episodes):
-    """Return some episodes, normalised by the statistics of all, as LeRobot's processors do."""
+    """Return the moments of some episodes, normalised by all, as LeRobot's processors do: -1 if constant."""
     steps = LeRobotDemonstrations(dataset.root, observation_keys=policy.config.observed).data
     steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
     low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
-    steps["action"] = 2 * (steps["action"] - low) / (high - low) - 1
+    steps["action"] = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1
     return moments_for(policy, steps)
 
 
 def test_it_is_preconditioned_for_the_episodes_of_the_training(found, tmp_path):
+    from lerobot.datasets import LeRobotDatasetMetadata
+
     root = tmp_path / "data"
-    write_lerobot(root, (12, 12, 12), data_files_size_in_mb=0.001)
+    write_lerobot(root, (12, 12, 12), resting=["action"], data_files_size_in_mb=0.001)
     for episodes in ([0, 2], None):
         policy, dataset = dataset_policy(found, root, episodes)
         expected = moments_by_hand(policy, dataset, episodes or [0, 1, 2])
         torch.testing.assert_close(policy.actor.network.moments.state_dict(), expected)
+    alone = found["warm_flow"](policy.config, dataset_meta=LeRobotDatasetMetadata("local/tiny", root=root))
+    torch.testing.assert_close(alone.actor.network.moments.state_dict(), expected)
     (root / "data/chunk-000/file-001.parquet").unlink()
     dataset_policy(found, root, [0, 2])
 
