@@ -157,23 +157,6 @@ def test_zero_network_is_optimal_for_gaussian_data(prior, keep, withhold, path):
         assert float((mine - u).square().mean()) == pytest.approx(best, rel=0.01, abs=1e-6)
 
 
-def test_moments_against_monte_carlo():
-    """Of AR(1) actions, in closed form: a0 is the action H steps ago plus noise."""
-    keep, sigma, chunk = 0.8, 0.5, 2
-    prior = PastPrior(chunk, sigma=sigma)
-    windows = buffer_of(gaussian_steps(episodes=3000, keep=keep), prior, 60_000).sample()
-    warm = is_warm(prior, windows) & ~windows["action_is_pad"].any(1)
-    moments = SourceMoments.fit(windows[warm], prior, generator=torch.Generator().manual_seed(0))
-    mean = torch.tensor([0.3, -0.2]).expand(chunk, 2)
-    one = torch.ones(chunk, 2)
-    close = {"atol": 0.01, "rtol": 0.02}
-    torch.testing.assert_close(moments.source_mean, mean, **close)
-    torch.testing.assert_close(moments.target_mean, mean, **close)
-    torch.testing.assert_close(moments.target_variance, 0.16 * one, **close)
-    torch.testing.assert_close(moments.source_variance, (0.16 + sigma**2) * one, **close)
-    torch.testing.assert_close(moments.covariance, 0.16 * keep**chunk * one, **close)
-
-
 def test_padded_positions_do_not_count():
     """Every episode is 3 steps long and its last action is far away: position 3 is never seen."""
     data = steps_of(torch.tensor([[0.1], [0.2], [9.0]]).repeat(100, 1), 3)
