@@ -59,14 +59,17 @@ def test_rows_of_a_ray_cluster_are_those_of_this_machine(finished, tmp_path, ray
     assert untimed(tmp_path / "out") == untimed(finished)
 
 
-@pytest.mark.parametrize("cell", [Cell(20, 3), Cell(20, 3, 1, 3, RealTimeChunking(schedule="linear"))])
+GUIDED = Cell(20, 3, 1, 3, RealTimeChunking(schedule="linear"))
+
+
+@pytest.mark.parametrize("cell", [Cell(20, 3), GUIDED, Cell(20, 3, temperature=0.0)])
 def test_a_row_is_what_episodes_played_by_hand_give(finished, cell):
     policies = policies_of(arguments(finished.parent / "new"))
     policy = next(p for p in policies if p.method.name == "past" and p.training.seed == 1)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + 7)
     found = common.row(policy, cell, play(policy, cell, PRESETS["quick"].evaluation, seeds)[::-1], {})
     assert (found["checkpoint"], found["nfe"]) == (20, 3) and found.get("execute") == cell.execute
-    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
+    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance, temperature=cell.temperature)
     played = {"execute": cell.execute, "delay": cell.delay, "success": "solved"}
     transforms = policy_transforms(actor.prior, normalizer=drift.task().normalizer, **played)
     env, keys = TransformedEnv(DriftEnv(), transforms), {"success": "solved"}
@@ -81,6 +84,19 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell):
         (mine,) = (row for row in stored(finished) if facts <= row.items())
         assert all(mine[name] == found[name] for name in found)
         assert 0 < mine["success_rate"] < 1 and "episode_side" in mine
+
+
+def test_temperatures_are_played_with_one_training(tmp_path, capsys):
+    out = tmp_path / "runs" / "out"
+    argv = arguments(out, prior=["gaussian", "past"], nfe=1, seeds=1, checkpoints=1, temperature=[1, 0])
+    assert robomimic.main(argv) == 0
+    rows = stored(out)
+    cells = [(row["prior"], row["temperature"]) for row in rows]
+    assert cells == list(product(("gaussian", "past"), (1.0, 0.0)))
+    assert len({row["policy"] for row in rows}) == 2
+    assert len({row["boundary_jump"] for row in rows}) == 4  # each is played otherwise
+    assert "noise x 0" in (out / "report.md").read_text()
+    assert "temperature" in refused(robomimic.main, arguments(tmp_path / "two", temperature=-1), capsys)
 
 
 def test_a_run_continues_with_what_is_missing(finished, tmp_path, capsys):
