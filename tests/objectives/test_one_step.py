@@ -38,6 +38,11 @@ def test_bad_options():
         FlowMatchingLoss(actor, objective="l2")
     with raises(ValueError, "PolynomialInterpolant"):
         FlowMatchingLoss(actor, objective="l1", interpolant=PolynomialInterpolant())
+    with raises(ValueError, "max_nfe=1"):
+        FlowMatchingLoss(actor, times="start")
+    single = actor_for(PastPrior(H), max_nfe=1)
+    with raises(ValueError, "LinearInterpolant", "PolynomialInterpolant"):
+        FlowMatchingLoss(single, times="start", interpolant=PolynomialInterpolant())
 
 
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.name)
@@ -49,11 +54,3 @@ def test_regression_is_the_error_of_one_step_from_the_source(prior):
     torch.testing.assert_close(loss_of(actor, data, times="start"), expected)
     chunk = actor(data, generator=torch.Generator().manual_seed(2))["vla_action", "chunk"]
     torch.testing.assert_close(chunk, reached)
-
-
-def test_regression_has_no_flow():
-    actor = actor_for(PastPrior(H), max_nfe=1)
-    with raises(ValueError, "max_nfe=1"):
-        FlowMatchingLoss(actor_for(PastPrior(H)), times="start")
-    with raises(ValueError, "LinearInterpolant", "PolynomialInterpolant"):
-        FlowMatchingLoss(actor, times="start", interpolant=PolynomialInterpolant())
