@@ -159,7 +159,7 @@ def test_a_mean_of_another_shape_or_type():
             (lambda loc, warm: (loc[0], warm), "loc", "[3, 2]", "[4, 3, 2]"),
             (lambda loc, warm: (loc, warm[..., :1, :]), "warm", "[4, 1, 1]", "[4, 3, 1]"),
             (lambda loc, warm: (loc, warm.expand_as(loc)), "warm", "[4, 3, 2]", "[4, 3, 1]"),
-            (lambda loc, warm: (loc, warm.float()), "bool"),
+            *((lambda loc, warm: (loc, warm.float()), "bool"), (lambda loc, warm: loc, "Tensor")),
         ):
             wrong = Wrong(3)
             wrong.change = change

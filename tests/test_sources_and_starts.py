@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from lab.couplings import ReflowCoupling
@@ -13,14 +12,12 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     PastPrior,
-    PriorAnchor,
     Source,
     VelocityMLP,
     WarmPriorActor,
     WithheldHistory,
     window_replay_buffer,
 )
-from warmprior.history import cold_history
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import Registered
 from warmprior.rl import has_anchor
@@ -39,13 +36,6 @@ class OwnSource(Prior, nn.Module):
     def distribution(self, history, observation=None):
         loc = torch.ones_like(history["forecast"])
         return Source(loc, 0.1 * loc, torch.ones_like(loc[..., :1], dtype=torch.bool))
-
-
-class NoWarm(Prior):
-    name = "tests.no-warm"
-
-    def mean(self, history):
-        return history["actions"]
 
 
 def network():
@@ -72,17 +62,6 @@ def cloning(folder, data, start=None, **options):
 def test_agents_search_around_a_source_that_has_no_mean_of_the_history():
     actor = WarmPriorActor(network(), OwnSource(H))
     assert has_anchor(actor) and Method(f"{__name__}:OwnSource", H).remembers
-    transform = PriorAnchor(actor)
-    data = transform._call(TensorDict({"history": cold_history([2], H, H, D_A)}, [2]))
-    assert (data["prior", "anchor"] == 1).all()
-
-
-def test_a_mean_that_is_no_pair_is_named():
-    actor = WarmPriorActor(network(), NoWarm(H))
-    history = cold_history([2], H, H, D_A)
-    for call in (lambda: PriorAnchor(actor), lambda: actor.prior.distribution(history)):
-        with raises(ValueError, "NoWarm.mean", "Tensor"):
-            call()
 
 
 def test_a_start_point_is_fixed_and_belongs_to_the_training(tmp_path, data):

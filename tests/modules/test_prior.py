@@ -2,20 +2,10 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.paper_facts import SIGMA
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
-
-
-@pytest.mark.parametrize("prior_class", PRIORS)
-@pytest.mark.parametrize("horizon", [1, 2, 8])
-def test_lengths_and_default_sigma(prior_class, horizon):
-    prior = prior_class(horizon)
-    length = 2 * horizon if prior_class is PreviewPrior else horizon
-    assert (prior.prediction_length, prior.history_length) == (length, horizon)
-    assert (prior.sigma, prior.correlation) == (SIGMA[prior.name], 0.0)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])

@@ -64,13 +64,8 @@ def test_the_same_prior_has_one_configuration():
 
 
 def test_what_cannot_be_saved_is_told_before_anything_is_trained(tmp_path):
-    prior = Anchor(H, gain=torch.ones(2))
-    with raises(TypeError, "Anchor"):
-        BehaviourCloning(actor_for(prior), demonstrations(), TrainingConfig(iterations=20), tmp_path)
-    assert not list(tmp_path.iterdir())
+    """Or what another object would be built from."""
 
-
-def test_what_another_object_would_be_built_from_is_refused(tmp_path):
     class Half(PastPrior):
         name = "half-of-the-tests"
 
@@ -86,9 +81,13 @@ def test_what_another_object_would_be_built_from_is_refused(tmp_path):
 
     recipe = TrainingConfig(iterations=2)
     try:
-        for prior, error, fact in ((Half(H), ValueError, "sigma"), (Default(H), TypeError, "horizon")):
+        for prior, error, fact in (
+            *((Half(H), ValueError, "sigma"), (Default(H), TypeError, "horizon")),
+            (Anchor(H, gain=torch.ones(2)), TypeError, "Anchor"),
+        ):
             with raises(error, fact):
                 BehaviourCloning(actor_for(prior), demonstrations(), recipe, tmp_path)
+        assert not list(tmp_path.iterdir())
         assert repr(Default(H)) == "Default(...)"
     finally:
         del Prior.classes["half-of-the-tests"], Prior.classes["default-of-the-tests"]

@@ -177,17 +177,6 @@ def test_grippers_go_where_they_are_told(env):
     assert steps.max() <= H
 
 
-def test_rows_that_rest_stay_where_they_are():
-    env = grippers("serial-outside")
-    td = env.reset()
-    chunk, end = targets(td["eef_pose"][1, 0].double().numpy(), np.random.default_rng(0))
-    td["vla_action", "chunk"] = ((torch.from_numpy(chunk).float() - 1) / 4).expand(2, H, 10)
-    td["_step"] = torch.tensor([False, True])
-    stepped = env.step(td)["next"]
-    torch.testing.assert_close(stepped["eef_pose"][0], td["eef_pose"][0])
-    np.testing.assert_allclose(stepped["eef_pose"][1, 0].numpy(), end, atol=2e-5)
-
-
 def test_refusals():
     with raises(ValueError, "output_max", [6], [3]):
         AbsoluteActions([0.05] * 3)
