@@ -7,7 +7,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
-from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, closing, mlp_actor, placed
+from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, Halfway, closing, mlp_actor, placed
 from warmprior import (
     ActionHistory,
     ChunkStep,
@@ -16,7 +16,6 @@ from warmprior import (
     PastPrior,
     PreviewPrior,
     PriorAnchor,
-    StartPoint,
 )
 from warmprior.modules.prior import Source
 
@@ -90,18 +89,13 @@ class Learned(PastPrior, nn.Module):
         return Source(loc, torch.full_like(loc, 0.5), torch.ones_like(loc[..., :1]).bool())
 
 
-class Halved(StartPoint):
-    """Half-way from noise to the observation."""
+class Seeing(Halfway):
+    """The observation counts too."""
 
-    name = "halved-of-the-anchor"
-    time = 0.5
-    noise_share = 0.4
+    name = "seeing-of-the-anchor"
 
     def centre(self, history, observation):
-        return 0.5 * observation[..., -1:, -ACTION_DIM:].expand_as(history["forecast"]) + 0.25
-
-    def forward(self, noise, history, observation):
-        return self.centre(history, observation) + self.noise_share * noise
+        return super().centre(history, observation) + observation[..., -1:, -ACTION_DIM:]
 
 
 def observing(actor):
@@ -122,12 +116,13 @@ def test_a_learned_mean_is_the_anchor_from_the_first_decision_on():
 
 @pytest.mark.parametrize("prior_class", PRIORS)
 def test_the_anchor_of_a_policy_that_starts_on_the_way_is_the_centre_there(prior_class):
-    actor = actor_for(prior_class(H), start=Halved())
+    actor = actor_for(prior_class(H), start=Seeing(0.25))
     data = observing(actor)
-    centre = actor.start.centre(data["history"], data["observation"])
+    last, seen = data["history", "actions"][..., -1:, :], data["observation"][..., -1:, -ACTION_DIM:]
+    centre = (last + 0.25 + seen).expand_as(data["history", "forecast"])
     assert torch.equal(data["prior", "anchor"], centre)
     actor.sampler(data)
-    eps = (data["prior", "noise"] - centre - 0.4 * data["prior", "loc"]) / 0.4
+    eps = (data["prior", "noise"] - centre - 0.5 * data["prior", "loc"]) / 0.5
     assert data["prior", "noise"].isfinite().all() and 0.2 < eps.std() < 2
 
 
@@ -136,15 +131,6 @@ def test_a_partly_collected_history_is_not_an_anchor():
     data = build("single", PastPrior(H), execute=2, cold="zero").rollout(2)
     assert data["history", "actions"][1].any() and data["history", "steps"][1] < H
     assert not data["prior", "anchor"][1].any()
-
-
-def test_one_environment_may_reset_alone():
-    env = build("serial-outside", PastPrior(H))
-    data = env.step_mdp(env.rand_step(env.reset()))
-    kept = data["prior", "anchor"].clone()
-    data = env.reset(data.set("_reset", torch.tensor([[True], [False]])))
-    assert torch.equal(data["prior", "anchor"][1], kept[1])
-    assert not torch.equal(data["prior", "anchor"][0], kept[0])
 
 
 @pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
