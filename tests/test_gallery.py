@@ -4,7 +4,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "gallery.md").read_text()
 FILES = ROOT / "docs" / "_static" / "gallery"
-LIMIT, VIDEO_LIMIT = 4_000_000, 250_000
 DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|draw)\(|from robomimic import run\b")
 
 

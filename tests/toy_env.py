@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from warmprior import ActionWindow, Prior, StartPoint, VelocityMLP, WarmPriorActor
+from warmprior import ActionWindow, PastPrior, Prior, StartPoint, VelocityMLP, WarmPriorActor
 from warmprior.history import advance, cold_history, without
 
 ACTION_DIM = 2
@@ -158,6 +158,23 @@ class Momentum(Prior):
         ahead = torch.arange(1, self.prediction_length + 1).view(-1, 1)
         warm = (history["steps"] >= 2).unsqueeze(-1)
         return last + ahead * (last - before), warm.expand_as(history["forecast"][..., :1])
+
+
+class Learned(PastPrior, nn.Module):
+    """A source whose shift is trained with the network."""
+
+    name = "learned-of-the-tests"
+
+    def __init__(self, chunk_length, *, action_dim=ACTION_DIM):
+        nn.Module.__init__(self)
+        super().__init__(chunk_length)
+        self.action_dim = action_dim
+        self.shift = nn.Parameter(torch.zeros(action_dim))
+        self.register_buffer("offset", torch.zeros(()))
+
+    def mean(self, history):
+        loc, warm = super().mean(history)
+        return loc + self.shift + self.offset, warm
 
 
 class Halfway(StartPoint):

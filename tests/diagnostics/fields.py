@@ -2,8 +2,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.toy_env import stirred
-from warmprior import GaussianPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior import GaussianPrior, WarmPriorActor
 from warmprior.history import cold_history
 
 H, D_A = 3, 2
@@ -48,10 +47,3 @@ def remember(data, loc, warm=True):
     for actions in ("actions", "forecast"):
         history[actions][:, :length] = loc[:, :length]
     return data
-
-
-def seeing_network(d_a, state_dim, length):
-    """A small network that sees one camera, with weights of which none is zero."""
-    torch.manual_seed(0)
-    encoder = ImageEncoder(["cam_image"], state_dim, image_size=16, crop_size=12, backbone="small")
-    return stirred(VisionNetwork(encoder, VelocityMLP(d_a, encoder.observation_dim, length, hidden_dim=16)))

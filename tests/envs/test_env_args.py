@@ -21,8 +21,6 @@ from warmprior.rotation import (
 )
 
 TASKS = ("lift", "can", "square", "transport")
-# The hand body seen from the grip site, as scipy writes it.
-SITE = Rotation.from_euler("z", -90, degrees=True)
 finite = st.floats(-4, 4, allow_nan=False, width=64)
 
 

@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 from lab.statistics import bootstrap_ratio, chosen_elsewhere, paired_probability_better, probability_better
 from tests.errors import raises
 
-rates = st.lists(st.floats(0, 1), min_size=1, max_size=8)
-
 
 def test_bootstrap_agrees_with_the_delta_method():
     """Independent groups of one: the interval is the ratio plus and minus 1.96 standard errors."""

@@ -3,10 +3,9 @@ from functools import partial
 
 import pytest
 import torch
-from torch import nn
 
 from tests.errors import raises
-from tests.toy_env import demonstrations, mlp_actor
+from tests.toy_env import Learned, demonstrations, mlp_actor
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder
 from warmprior.modules.option_text import find, make, options_of
 from warmprior.modules.registry import from_config
@@ -29,23 +28,6 @@ class Anchor(PastPrior):
     def mean(self, history):
         loc, warm = super().mean(history)
         return self.gain * loc, warm
-
-
-class Learned(PastPrior, nn.Module):
-    """A source whose shift is trained with the network."""
-
-    name = "learned-of-the-tests"
-
-    def __init__(self, chunk_length, *, action_dim=D_A):
-        nn.Module.__init__(self)
-        super().__init__(chunk_length)
-        self.action_dim = action_dim
-        self.shift = nn.Parameter(torch.zeros(action_dim))
-        self.register_buffer("offset", torch.zeros(()))
-
-    def mean(self, history):
-        loc, warm = super().mean(history)
-        return loc + self.shift + self.offset, warm
 
 
 def test_arguments_of_its_own_are_part_of_its_configuration():

@@ -5,10 +5,10 @@ import os
 import signal
 
 import torch
-from torch import nn
 
+from tests.toy_env import Learned
 from tests.training.cloning_parts import CONFIG, actor_for, mlp, run_until, training, weights
-from warmprior import PastPrior, PreconditionedNetwork, SourceMoments
+from warmprior import PastPrior
 from warmprior.io.distributed import rank
 
 STEPS = dataclasses.replace(
@@ -16,32 +16,12 @@ STEPS = dataclasses.replace(
 )
 
 
-class LearningPrior(PastPrior, nn.Module):
-    """It learns how far to trust the past, with the flow."""
-
-    name = "learning-past"
-
-    def __init__(self, chunk_length: int) -> None:
-        nn.Module.__init__(self)
-        super().__init__(chunk_length)
-        self.trust = nn.Parameter(torch.ones(2))
-
-    def mean(self, history):
-        loc, warm = super().mean(history)
-        return self.trust * loc, warm
-
-
-def standardised():
-    one = torch.ones(4, 2)
-    return PreconditionedNetwork(mlp(), moments=SourceMoments(0 * one, 0 * one, one, one, 0 * one))
-
-
 CLIPPED = 0.1
 CASES = {
     "plain": ({}, {}, lambda: actor_for(PastPrior(4), mlp())),
     "dropout, withheld": ({"cold_probability": 0.5}, {}, actor_for),
-    "clipped": ({"max_grad_norm": CLIPPED}, {}, lambda: actor_for(LearningPrior(4), mlp())),
-    "learning prior": ({}, {}, lambda: actor_for(LearningPrior(4), mlp())),
+    "clipped": ({"max_grad_norm": CLIPPED}, {}, lambda: actor_for(Learned(4), mlp())),
+    "learning prior": ({}, {}, lambda: actor_for(Learned(4), mlp())),
 }
 """Recipes, options and policies."""
 
