@@ -15,8 +15,6 @@ from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
 from tests.toy_env import CountingEnv
 from warmprior import PastPrior, PreviewPrior, policy_transforms
-from warmprior.deploy import AsyncExecutor
-from warmprior.diagnostics import executed_actions
 from warmprior.history import cold_history, window_history
 from warmprior.lerobot import LeRobotActor
 from warmprior.lerobot.names import entry_names
@@ -143,21 +141,6 @@ def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     # A function of the source alone, whatever else is in the batch.
     assert torch.equal(decoder(data.clone())["vla_action", "chunk"], chunk)
     torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
-
-
-@pytest.mark.parametrize("prior", [PastPrior(LENGTH), PreviewPrior(LENGTH // 2)], ids=str)
-def test_an_executor_runs_it_as_an_environment_does(policy, prior):
-    made = policy("smolvla")
-    env = TransformedEnv(Arm(), policy_transforms(prior, observation_steps=1))
-    with torch.no_grad():
-        expected = executed_actions(env.rollout(99, actor_of(made, prior)))[0]
-    arm, actions = Arm(), []
-    with AsyncExecutor(actor_of(made, prior), latency=0) as executor:
-        data = arm.reset()
-        while not data["done"]:
-            actions.append(executor.act(data["observation"]))
-            data = arm.step(data.set("action", actions[-1]))["next"]
-    torch.testing.assert_close(torch.stack(actions), expected)
 
 
 def test_decisions_of_several_threads_take_turns(policy):
