@@ -8,7 +8,7 @@ from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import CountingEnv
 from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
 from warmprior.envs import NavigationEnv
 
@@ -54,36 +54,6 @@ def test_constant_dimension():
     moved = raw.clone()
     moved["observation"][:, 1] += 0.25  # a value that the data never showed stays finite
     assert torch.allclose(normalizer.normalize(moved)["observation"][:, 1], torch.tensor(0.25))
-
-
-@pytest.mark.parametrize("batched", [False, True])
-def test_environment_side_equals_data_side(batched):
-    raw = data()
-    normalizer = Normalizer.fit(raw)
-
-    def make():
-        return TransformedEnv(CountingEnv(5), Compose(*normalizer.env_transforms()))
-
-    env = SerialEnv(2, make) if batched else make()
-    plain = CountingEnv(5)
-    check_env_specs(env)
-    torch.manual_seed(1)
-    data_ = env.reset()
-    plain.episode = int(normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 1].round() - 1)
-    expected = plain.reset()
-    for _ in range(4):
-        first = data_["observation"].reshape(-1, 4)[0]
-        torch.testing.assert_close(first, normalizer.normalize(expected)["observation"])
-        action = torch.rand(*env.batch_size, ACTION_DIM) * 2 - 1
-        normalized = TensorDict({"action": action.reshape(-1, ACTION_DIM)[0]}, [])
-        data_ = env.step(data_.set("action", action))["next"]
-        expected["action"] = normalizer.denormalize(normalized)["action"]
-        expected = plain.step(expected)["next"]
-    # What reached the simulator is the denormalised action: the toy shows it in its observation.
-    torch.testing.assert_close(
-        normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 2:],
-        normalizer.denormalize(normalized)["action"],
-    )
 
 
 class Whole(CountingEnv):
