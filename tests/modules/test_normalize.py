@@ -26,19 +26,6 @@ def data(n=40):
     )
 
 
-def test_closed_form():
-    raw = data()
-    out = Normalizer.fit(raw).normalize(raw)
-    for key in ("observation", "action"):
-        for d in range(raw[key].shape[-1]):
-            column = raw[key][:, d]
-            low, high = min(column.tolist()), max(column.tolist())
-            expected = 2 * (column - low) / (high - low) - 1
-            torch.testing.assert_close(out[key][:, d], expected, rtol=1e-4, atol=1e-5)
-        assert out[key].min() >= -1 - 1e-5 and out[key].max() <= 1 + 1e-5
-    assert torch.equal(out["episode"], raw["episode"])
-
-
 def test_constant_dimension():
     raw = data()
     raw["observation"][:, 1] = 7.5

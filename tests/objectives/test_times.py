@@ -50,18 +50,6 @@ def test_the_loss_is_given_them():
     assert torch.equal(losses["uniform"], loss_of(actor, data))
     assert len({loss.item() for loss in losses.values()}) == 2
 
-    def constant(shape, generator, dtype, device):
-        return torch.full(shape, 0.25, dtype=dtype, device=device)
-
-    # By hand: the same source, at that time.
-    loss = FlowMatchingLoss(actor, times=constant, generator=torch.Generator().manual_seed(2))
-    a1 = data["vla_action", "chunk"]
-    a0 = prior.sample(data["history"], generator=torch.Generator().manual_seed(2))
-    predicted = actor.network(torch.full((6,), 0.25), 0.75 * a0 + 0.25 * a1, data["observation"])
-    counted = ~data["action_is_pad"]
-    expected = (predicted - (a1 - a0)).square()[counted].mean()
-    torch.testing.assert_close(loss(data)["loss_flow_matching"], expected)
-
 
 def test_a_coupling_with_times_takes_no_others():
     actor, coupling = actor_for(PastPrior(4)), SimpleNamespace(times=TIMES["start"])
