@@ -7,20 +7,6 @@ from warmprior import PastPrior, PriorSampler, Source, StartPoint, VelocityMLP, 
 from warmprior.history import ENTRIES
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_writes_the_source(shape):
-    prior = PastPrior(4)
-    data = TensorDict({"history": random_history(prior, *shape)}, shape)
-    sampler = PriorSampler(prior, generator=torch.Generator().manual_seed(1))
-    out = sampler(data.clone())
-    eps = torch.randn(*shape, 4, 2, generator=torch.Generator().manual_seed(1))
-    warm = (data["history", "steps"] >= 4).unsqueeze(-1)
-    loc = warm * data["history", "actions"]
-    assert torch.equal(out["prior", "loc"], loc)
-    assert torch.equal(out["prior", "warm"], warm.expand(*shape, 4, 1))
-    torch.testing.assert_close(out["prior", "noise"], warm * (loc + 0.5 * eps) + ~warm * eps)
-
-
 class Observing(PastPrior):
     name = "observing-of-the-sampler"
 

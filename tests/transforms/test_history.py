@@ -86,17 +86,6 @@ def test_history_is_the_list_of_executed_actions(lengths, horizon, further, long
                 executed, left = [], []
 
 
-@pytest.mark.parametrize(("horizon", "length"), [(1, 1), (4, 8)])
-def test_specs_and_cold_reset(horizon, length):
-    env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 9)), transforms(horizon, length))
-    check_env_specs(env)
-    data = env.reset()
-    assert set(data.keys(True, True)) >= LEAVES
-    assert data[keys.ACTIONS].shape == (2, horizon, ACTION_DIM)
-    assert data[keys.FORECAST].shape == (2, length, ACTION_DIM)
-    assert not any(data[key].any() for key in LEAVES)
-
-
 def test_parts_that_do_not_go_together():
     for behind in ([], [ChunkStep(3)]):
         with raises(KeyError, "ChunkStep"):
