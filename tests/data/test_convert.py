@@ -15,12 +15,12 @@ from tests.errors import raises
 from warmprior.data import DatasetError, LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
 
 
-def with_images(path, cameras=("agentview", "robot0_eye_in_hand"), side=32):
+def with_images(path):
     with h5py.File(path, "a") as file:
         for number, demo in enumerate(file["data"].values()):
             demo["obs"].pop("agentview_image", None)
-            images = [scene(number, step, side) for step in range(len(demo["actions"]))]
-            for camera in cameras:
+            images = [scene(number, step) for step in range(len(demo["actions"]))]
+            for camera in ("agentview", "robot0_eye_in_hand"):
                 demo[f"obs/{camera}_image"] = np.stack(images)
     return path
 

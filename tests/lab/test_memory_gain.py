@@ -50,20 +50,18 @@ def repeats(share):
 
 
 @pytest.mark.parametrize("prior", [PastPrior(H, sigma=0.5), PreviewPrior(H)])
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("share", [-0.4, 0.0, 0.3, 1.0, 2.0])
 def test_the_gain_is_the_share_that_is_repeated(prior, share):
     found = memory_gain(policy(repeats(share), prior), windows(prior), nfes=(1,))
     assert found == {1: pytest.approx(share, abs=1e-5)}
 
 
 def test_the_gain_is_the_mean_slope_over_dimensions():
-    """What of a dimension appears in another one is none, and what turns round counts against it."""
+    """What of a dimension appears in another one is none."""
     prior, matrix = PastPrior(H), torch.tensor([[1.0, 2.0], [0.0, -0.5]])
     field = policy(lambda t, a, o: a @ matrix.T - a, prior)
     found = memory_gain(field, windows(prior, N), nfes=(1,))
     assert found[1] == pytest.approx(0.25, abs=0.03)
-    undone = memory_gain(policy(repeats(-0.4), prior), windows(prior), nfes=(1,))
-    assert undone[1] == pytest.approx(-0.4, rel=1e-4)
 
 
 @pytest.mark.parametrize("shift", [0.01, 0.05, 0.2])
