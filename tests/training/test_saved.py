@@ -19,7 +19,6 @@ from warmprior import (
     PastPrior,
     PreconditionedNetwork,
     PreviewPrior,
-    Prior,
     RealTimeChunking,
     VelocityMLP,
     WarmPriorActor,
@@ -98,17 +97,6 @@ def test_round_trip_is_bit_identical(tmp_path, make):
     assert policy_config(again) == policy_config(actor.replace()) == config
     assert torch.equal(chunk(again), chunk(actor))
     assert same(actor.state_dict(), again.state_dict())
-
-
-def test_a_user_s_prior_travels(tmp_path):
-    class Still(PastPrior):
-        name = "still-for-this-test"
-
-    saved(tmp_path, Still(H))
-    assert type(load_policy(tmp_path).prior) is Still
-    del Prior.classes["still-for-this-test"]
-    with raises(ValueError, "'still-for-this-test'"):
-        load_policy(tmp_path)
 
 
 @pytest.mark.parametrize("parts", ["all", "network", "normalizer"])
