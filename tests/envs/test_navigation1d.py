@@ -104,6 +104,8 @@ def test_metrics_of_known_paths():
     assert [m.collision_rate for m in one.values()] == [0, 1, 0, 0]
     assert one["c"].recombination_rate == 1.0 and one["a"].recombination_rate == 0.0
     assert all(m.distance == 0 for m in one.values())
+    slow = torch.linspace(0.6, -0.6, 64)[None]  # several steps near the axis, on neither side
+    assert navigation_metrics(slow, 4).commit_rate == 0 and navigation_metrics(0 * slow, 4).commit_rate == 1
     assert one["a"].jump < 0.1 < one["s"].jump
     routes = torch.stack([above, below, crossing, -crossing])
     assert navigation_metrics(routes, 4).route_entropy == pytest.approx(2.0)

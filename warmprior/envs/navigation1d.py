@@ -233,7 +233,7 @@ class NavigationMetrics:
     Attributes:
         switch_rate: share of chunk boundaries at which the side changes, among those with a side before and
             after; NaN if there is none.
-        commit_rate: share of rollouts that never change sides.
+        commit_rate: share of rollouts that are never on both sides.
         collision_rate: share of rollouts that enter an obstacle.
         route_entropy: entropy in bits of the four routes (above or below each obstacle): 1 if only the two
             demonstrated ones occur equally often, 2 if all four do.
@@ -275,18 +275,16 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
     check_between(1, STEPS - 1, chunk_length=chunk_length)
     x, demonstrations = navigation_positions().to(heights.device), navigation_heights()
     side = torch.where(heights.abs() > UNDECIDED, heights.sign(), 0.0)
-    changes = side[:, 1:] * side[:, :-1] < 0
-    decided = side[:, 1:] * side[:, :-1] != 0
     boundary = torch.arange(chunk_length - 1, STEPS - 1, chunk_length)
-    at_boundary = decided[:, boundary]
+    both = side[:, boundary] * side[:, boundary + 1]
     above = (heights[:, _middles()] > 0).long()
     routes = torch.bincount(2 * above[:, 0] + above[:, 1], minlength=4).double() / len(heights)
     taken = routes[routes > 0]
     hit = navigation_collides(x.expand_as(heights), heights).any(1)
     gap = (heights[:, None] - demonstrations.to(heights.device)).abs().amin(1)
     return NavigationMetrics(
-        switch_rate=float(changes[:, boundary].sum() / at_boundary.sum()) if at_boundary.any() else math.nan,
-        commit_rate=float((~changes.any(1)).double().mean()),
+        switch_rate=float((both < 0).sum() / (both != 0).sum()) if both.any() else math.nan,
+        commit_rate=float((~((side > 0).any(1) & (side < 0).any(1))).double().mean()),
         collision_rate=float(hit.double().mean()),
         route_entropy=abs(float((taken * taken.log2()).sum())),
         recombination_rate=float(routes[1] + routes[2]),
