@@ -81,3 +81,29 @@ def test_keys_that_are_not_there_are_named():
     for options in ({"success": "solved"}, {"success": "won", "measures": {"height": "max"}}):
         with raises(KeyError, *([options["success"]] if len(options) == 1 else options["measures"])):
             play_episode(POLICY, env, 0, **options)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_what_a_chunk_would_hide_from_an_episode_is_refused(batched):
+    """Such as a success at the second of four steps, or the largest reward of a single step."""
+    for options, asked, fact in (
+        ({}, {"success": "won"}, "won"),
+        ({"success": "won"}, {"success": "won", "measures": {"high": "max"}}, "high"),
+        ({"success": "won", "measures": HOW}, {"success": "won", "measures": {"high": "last"}}, "high"),
+        ({"success": "won"}, {"success": "won", "measures": {"reward": "max"}}, "reward"),
+        ({"success": "won", "gamma": 0.9}, {"success": "won", "measures": {"reward": "sum"}}, "discounted"),
+    ):
+        base = SerialEnv(2, Saying) if batched else Saying()
+        whole = policy_transforms(PastPrior(H), observation_steps=1, **options)
+        with raises(ValueError, fact, "policy_transforms"):
+            evaluate(POLICY, TransformedEnv(base, whole), episodes=2, first_seed=0, **asked)
+        # Nothing is hidden from an episode that reads every step.
+        single = policy_transforms(PastPrior(H), observation_steps=1, execute=1, **options)
+        base = SerialEnv(2, Saying) if batched else Saying()
+        evaluate(POLICY, TransformedEnv(base, single), episodes=2, first_seed=0, **asked)
+
+
+def test_a_reward_may_be_summed():
+    measures = {"reward": "sum"}  # the toy pays t at step t
+    for episode in evaluate(POLICY, make_env(), episodes=3, first_seed=0, success="won", measures=measures):
+        assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))

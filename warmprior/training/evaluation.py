@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -25,6 +25,7 @@ from warmprior.modules.network import device_of
 from warmprior.training.parallel import base_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
+from warmprior.transforms.chunk import ChunkStep
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """A function that writes the next chunk."""
@@ -142,7 +143,8 @@ def play_episode(
             :func:`~warmprior.policy_transforms` too.
 
     Raises:
-        ValueError: if the environment has batch dimensions, or a seed is negative.
+        ValueError: if the environment has batch dimensions, its chunks combine the values of their steps in
+            another way, or a seed is negative.
         KeyError: if the environment lacks ``success``, one of ``measures``, or the policy's transforms.
 
     Examples:
@@ -160,7 +162,7 @@ def play_episode(
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
     check_whole_numbers(0, seed=seed, policy_seed=policy_seed)
-    _check_fit(policy, env, (success, *(measures or {})))
+    _check_fit(policy, env, success, measures or {})
     tally = _Tally(success, measures or {})
     noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
     with _acting(policy, env, int(noise_seed[0]), nfe) as act:
@@ -267,7 +269,7 @@ def _play_batched(
     measures: Measures,
 ) -> Generator[Episode]:
     num_envs = env.batch_size[0]
-    _check_fit(policy, env, (success, *measures))
+    _check_fit(policy, env, success, measures)
     home = env.device or torch.device("cpu")
     played = [0] * num_envs
     tallies = [_Tally(success, measures) for _ in played]
@@ -300,12 +302,16 @@ def _play_batched(
                 data = env.reset(data.set("_reset", done.to(home).unsqueeze(-1)))
 
 
-def _check_fit(policy: TensorDictModuleBase, env: EnvBase, read: Sequence[NestedKey]) -> None:
-    """Raise an error if a policy cannot act in an environment, or that does not write the ``read`` keys."""
+def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, measures: Measures) -> None:
+    """Raise an error if a policy cannot act in an environment, or that does not tell what is asked for."""
     check_usual_keys(policy, "evaluate")
-    present = env.observation_spec.keys(True, True)
-    for key in read:
-        if key not in present and key not in env.reward_keys:
+    asked, present, rewards = (
+        {success: "any", **measures},
+        env.observation_spec.keys(True, True),
+        env.reward_keys,
+    )
+    for key in asked:
+        if key not in present and key not in rewards:
             raise KeyError(
                 f"the environment does not write {key!r}, it writes {sorted(map(str, present))}: name the "
                 "key with success= or measures="
@@ -313,17 +319,26 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, read: Sequence[Nested
     if keys.EXECUTED not in present or keys.ACTIONS not in present:
         raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
     normalizer = getattr(policy, "normalizer", None)
-    if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
-        return  # transforms inside workers cannot be inspected
+    if isinstance(base_of(env), SerialEnv | ParallelEnv):
+        normalizer = None  # transforms inside workers cannot be inspected
     scalings: dict[NestedKey, Any] = {}
     while isinstance(env, TransformedEnv):
         for part in env.transform.modules():
-            if isinstance(part, ActionScaling):
+            if isinstance(part, ChunkStep) and part.execute > 1:
+                told = dict.fromkeys(rewards, "sum" if part.gamma == 1 else "discounted sum")
+                told |= {part.success: "any", **part.measures}
+                for key, how in asked.items():
+                    if (has := told.get(key, "last")) != how:
+                        raise ValueError(
+                            f"after a chunk, {key!r} is the {has} of its steps, but the evaluation asks for "
+                            f"the {how}: give policy_transforms the same success and measures, and gamma=1"
+                        )
+            elif isinstance(part, ActionScaling):
                 scalings[part.in_keys_inv[0]] = part
             elif isinstance(part, ObservationNorm):
                 scalings[part.in_keys[0]] = part
         env = env.base_env
-    for key in normalizer.keys:
+    for key in () if normalizer is None else normalizer.keys:
         for name in ("loc", "scale"):
             value = getattr(normalizer, name)(key)
             if key not in scalings or not torch.equal(getattr(scalings[key], name).to(value), value):
