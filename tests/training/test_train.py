@@ -45,6 +45,19 @@ def test_a_bound_of_ones_own_replaces_that_of_the_demonstrations():
     assert train(None, clip=0.5).sampling.clip == 0.5
 
 
+def test_gradients_that_rollouts_hold_make_no_difference():
+    """As those of `env.rollout(steps, expert)`, which TorchRL does not detach."""
+    torch.manual_seed(0)
+    values = {"observation": torch.rand(60, 3), "action": torch.rand(60, 2)}
+    policies = []
+    for of in (torch.Tensor.clone, lambda value: value.clone().requires_grad_() * 1):
+        steps = {name: of(value) for name, value in values.items()}
+        steps = TensorDict(steps | {"episode": torch.arange(60) // 20}, [60])
+        options = {"network": NETWORK, "training": CONFIG, "description": None}
+        policies.append(train_policy(steps, PastPrior(4), **options))
+    assert equal(*policies)
+
+
 BARS = """
 import sys
 from pathlib import Path

@@ -113,7 +113,7 @@ class Normalizer(RawUnits):
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
             # Halved first, because the sum of large numbers may be infinite.
-            first, last = (value[key].to(torch.get_default_dtype()) / 2 for value in (low, high))
+            first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first
             constant = half <= LEAST * loc.abs().clamp_min(1.0)
             if key == keys.ACTION:

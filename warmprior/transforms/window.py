@@ -90,6 +90,7 @@ class ActionWindow(Transform):
             nn.Buffer(value, persistent=False) for value in (start, end, offsets, recent)
         )
 
+    @torch.no_grad()  # an expert's rollouts may hold its gradients
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the windows of the sampled steps."""
         check_keys(tensordict, self.in_keys, "ActionWindow", ": see window_replay_buffer")
