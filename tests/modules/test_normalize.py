@@ -87,6 +87,10 @@ def test_errors():
                 convert(narrow.select(key))
     with raises(ValueError, "observation", "[9]", "[4]"):
         TransformedEnv(NavigationEnv(), fitted.env_transforms()[0]).observation_spec  # noqa: B018
+    for key in ("state", ("agent", "state")):  # an entry that the environment lacks would stay as it is
+        other = Normalizer({key: torch.zeros(4)}, {key: torch.ones(4)})
+        with raises(KeyError, str(key), "observation", "rename"):
+            TransformedEnv(CountingEnv(5), *other.env_transforms()).reset()
     one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
     with raises(ValueError, "a", "[2]", "[3]"):
         Normalizer(one, two)

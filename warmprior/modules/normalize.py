@@ -28,12 +28,14 @@ class FloatNorm(ObservationNorm):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Set the spec of what is normalised, which has the precision of the statistics, or a higher one."""
+        present = sorted(map(str, observation_spec.keys(True, True)))
+        hint = f", the environment writes {present}: rename its entry, or fit the normaliser to data with it"
+        check_keys(observation_spec, self.in_keys, "the normaliser of the demonstrations", hint)
         for key in self.in_keys:
-            leaf = observation_spec.get(key)
-            if leaf is not None:
-                check_width(key, leaf.shape, self.loc)
-            dtype = self.loc.dtype if leaf is None else torch.promote_types(leaf.dtype, self.loc.dtype)
-            if leaf is not None and leaf.dtype != dtype:
+            leaf = observation_spec[key]
+            check_width(key, leaf.shape, self.loc)
+            dtype = torch.promote_types(leaf.dtype, self.loc.dtype)
+            if leaf.dtype != dtype:
                 observation_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)
         return super().transform_observation_spec(observation_spec)
 
