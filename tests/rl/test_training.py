@@ -1,10 +1,27 @@
+from functools import partial
+
 import pytest
 import torch
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
-from tests.rl.training_parts import ALGORITHMS, H, check_transitions, from_step, make_actor, make_training
+from tests.rl.training_parts import (
+    ALGORITHMS,
+    EVALUATION_SEED,
+    LENGTHS,
+    H,
+    SolvableEnv,
+    check_transitions,
+    from_step,
+    make_actor,
+    make_config,
+    make_training,
+)
 from tests.states import copied, same
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
-from warmprior.rl import PriorSpaceTraining
+from tests.toy_env import ACTION_DIM
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
+from warmprior.rl import PriorSpace, PriorSpaceTraining
 
 pytest.importorskip("tqdm")
 
@@ -80,6 +97,43 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
     assert all(30 * k <= step < 30 * k + 2 * H for k, step in enumerate(steps[1::2], 1))
     for row in curve:
         assert row["episodes"] == 2 and row["success_rate"] == row["successes"] / 2
+
+
+class Doubles(SolvableEnv):
+    """The toy in double precision, as the environments of dm_control are."""
+
+    def __init__(self, length):
+        super().__init__(length, truncate=True)
+        self.observation_spec["observation"] = Unbounded((2 + ACTION_DIM,), dtype=torch.float64)
+        self.action_spec = Bounded(-1, 1, (ACTION_DIM,), dtype=torch.float64)
+        self.reward_spec = Unbounded((1,), dtype=torch.float64)
+
+    def _seen(self, out):
+        double = out.apply(lambda value: value.double() if value.is_floating_point() else value)
+        return super()._seen(double)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_environments_in_double_precision(tmp_path, algorithm):
+    actor = make_actor()
+
+    def make_doubles(seed):
+        transforms = policy_transforms(actor.prior, observation_steps=1)
+        transforms.append(PriorAnchor(actor))
+        return TransformedEnv(SerialEnv(2, [partial(Doubles, length) for length in LENGTHS]), transforms)
+
+    config = make_config(algorithm=algorithm)
+    training = PriorSpaceTraining(actor, make_doubles, config, tmp_path, evaluation_seed=EVALUATION_SEED)
+    training.run()
+    check_transitions(training)
+    stored = training.buffer[:]
+    assert (
+        stored["prior", "anchor"].dtype == torch.float64 and stored["prior", "delta"].dtype == torch.float32
+    )
+    # A tool's random residuals are an agent's, too.
+    env = make_doubles(0).append_transform(PriorSpace(training.decoder))
+    check_env_specs(env)
+    assert env.rand_action(env.reset())["prior", "delta"].dtype == torch.float32
 
 
 def test_the_targets_of_sac_by_hand(tmp_path):

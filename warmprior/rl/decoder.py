@@ -188,7 +188,8 @@ class PriorSpace(EnvTransform):
         self.decoder.check_env(self.parent)
         actions = input_spec["full_action_spec"]
         leaf, delta = actions[keys.CHUNK], self.decoder.delta
-        actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device)
+        # In the agent's precision, and not in that of the environment's actions.
+        actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, device=leaf.device)
         # The whole branch is removed, because an empty one would count as an action.
         del actions[keys.CHUNK[0]]
         return input_spec
@@ -264,7 +265,8 @@ class ResidualSampler(Drawing, TensorDictModuleBase):
         """Write the residual."""
         check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
         anchor = tensordict.get(self.in_keys[0])
-        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.chosen_generator()}
+        # In the agent's precision, because a replay buffer holds residuals of both.
+        like = {"device": anchor.device, "generator": self.chosen_generator()}
         if self.distribution == "uniform":
             delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
         else:

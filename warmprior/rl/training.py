@@ -263,7 +263,8 @@ class PriorSpaceTraining:
         """Add decisions to the replay buffer; return the number of their control steps."""
         transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
-        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
+        reward = following["reward"].to(torch.get_default_dtype())  # that of the critics
+        following["reward"] = reward - self.config.reward_offset * following[keys.EXECUTED]
         following["terminated"] = following["done"].clone()  # DSRL treats time-outs as terminations
         # Checked before saving, since a saved NaN would end every later training.
         self._check_finite(transitions)
