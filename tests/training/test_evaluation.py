@@ -159,6 +159,28 @@ def test_the_noise_of_an_episode_is_that_of_the_documented_seed():
     assert len(set(first.values())) == len(first)
 
 
+class Blurred(CountingEnv):
+    """Draws what it shows from PyTorch's global generator."""
+
+    def __init__(self):
+        super().__init__(5)
+        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+
+    def _seen(self, out):
+        seen = out["observation"] + torch.randn(2 + ACTION_DIM)
+        return out.update({"observation": seen, "success": out["done"]})
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_compiled_policy_plays_the_same_episodes(batched):
+    policy, chunks = mlp_actor(PRIOR, nfe=2), []
+    for each in (policy, torch.compile(policy, backend="eager")):
+        base = SerialEnv(2, Blurred) if batched else Blurred()
+        env = TransformedEnv(base, policy_transforms(PRIOR))
+        chunks.append(chunks_of(evaluate(each, env, episodes=3, first_seed=0)))
+    torch.testing.assert_close(*chunks)
+
+
 def test_actor_is_left_as_it_was_but_for_its_mode():
     generator = torch.Generator().manual_seed(5)
     actor = WarmPriorActor(Recorder(), PastPrior(H), nfe=2, generator=generator).train()

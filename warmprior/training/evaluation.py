@@ -21,7 +21,7 @@ from warmprior.checks import check_whole_numbers
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
-from warmprior.modules.network import device_of
+from warmprior.modules.network import device_of, uncompiled
 from warmprior.training.parallel import base_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
@@ -100,7 +100,7 @@ def _acting(policy: TensorDictModuleBase, env: EnvBase, seed: int, nfe: int | No
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     # A policy without an agent, such as random residuals for a decoder, may have no parameters.
     home, device = env.device or torch.device("cpu"), device_of(policy)
-    if "generator" in inspect.signature(policy.forward).parameters:
+    if "generator" in inspect.signature(uncompiled(policy).forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
         seed ^= 1  # another seed for the environments
     # One thread: the simulators need the cores, and idle threads of a small policy would spin.
