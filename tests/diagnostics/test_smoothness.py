@@ -63,6 +63,12 @@ def test_against_loops(rows, decisions, horizon, seed):
     assert result.jerk == pytest.approx(mean(jerk), rel=1e-3, nan_ok=True)
 
 
+def test_jumps_between_chunks_that_hold_still_are_infinitely_larger():
+    chunks = torch.arange(3.0).view(3, 1, 1).expand(3, 2, 1)
+    assert smoothness(rollout_of(chunks, [2, 2, 2])).jump_ratio == math.inf
+    assert math.isnan(smoothness(rollout_of(chunks, [1, 1, 1])).jump_ratio)  # nothing inside a chunk
+
+
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
     with raises(KeyError, "ChunkStep"):

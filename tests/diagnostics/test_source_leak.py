@@ -116,9 +116,18 @@ def test_episodes_may_be_part_of_the_data():
     alone = data[:20].clone()
     assert source_leak(actor, alone, nfes=(1,))[1].data_spread > 0
     alone["vla_action", "chunk"][:] = 1.0
-    assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
+    assert source_leak(actor, alone, nfes=(1,))[1].data_spread == 0.0
     with raises(ValueError, "episode"):
         source_leak(actor, alone, episodes=episodes[:20])
+
+
+def test_noise_on_demonstrations_that_never_move_is_named():
+    data = windows(40)
+    data["vla_action", "chunk"].zero_()
+    noisy, still = (source_leak(policy(passing(share)), data, nfes=(1,))[1] for share in (0.5, 0.0))
+    assert noisy.data_spread == noisy.data_inner_step == 0 and noisy.spread > 0
+    assert noisy.leak == noisy.inner_step_ratio == math.inf and "spread" in noisy.warning
+    assert still.spread < 1e-6 and math.isnan(still.leak) and still.warning is None
 
 
 def test_padded_positions_do_not_count():

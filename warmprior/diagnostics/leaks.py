@@ -22,6 +22,7 @@ from warmprior.diagnostics.flow import (
     predict,
     seen_anew,
 )
+from warmprior.diagnostics.statistics import ratio
 from warmprior.modules.actor import WarmPriorActor
 
 LEAK_BOUND = 1.0
@@ -63,13 +64,13 @@ class SourceLeak:
 
     @property
     def leak(self) -> float:
-        """The ratio of the spread to the data's; NaN if the data do not spread."""
-        return _ratio(self.spread, self.data_spread)
+        """The ratio of the spread to the data's; infinite if the data alone do not spread."""
+        return ratio(self.spread, self.data_spread)
 
     @property
     def inner_step_ratio(self) -> float:
-        """The ratio of the inner step to the data's; NaN if the data do not move."""
-        return _ratio(self.inner_step, self.data_inner_step)
+        """The ratio of the inner step to the data's; infinite if the data alone do not move."""
+        return ratio(self.inner_step, self.data_inner_step)
 
     @property
     def warning(self) -> str | None:
@@ -189,10 +190,6 @@ def _data_spread(observation: Tensor, target: Tensor, counted: Tensor, episodes:
 def _inner_step(chunk: Tensor, counted: Tensor) -> float:
     step = torch.linalg.vector_norm(chunk.diff(dim=1), dim=-1)
     return float(step[counted[:, 1:] & counted[:, :-1]].mean())
-
-
-def _ratio(value: float, reference: float) -> float:
-    return value / reference if reference else math.nan
 
 
 def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.checks import check_finite_steps, check_keys
+from warmprior.diagnostics.statistics import ratio
 from warmprior.transforms.delay import executed_chunk
 
 
@@ -38,7 +39,7 @@ class Smoothness:
     @property
     def jump_ratio(self) -> float:
         """The ratio of boundary jump to inner jump; 1 if chunk ends make no difference."""
-        return self.boundary_jump / self.inner_jump if self.inner_jump else math.nan
+        return ratio(self.boundary_jump, self.inner_jump)
 
 
 def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,11 +1,18 @@
-"""The posterior of a success rate."""
+"""The posterior of a success rate, and ratios."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from warmprior.checks import check_between
 from warmprior.io.extras import require
+
+
+def ratio(value: float, reference: float) -> float:
+    """Return a quotient of numbers >= 0: infinite if only the reference is 0, and NaN if both are."""
+    rounding = 1e-6
+    return value / reference if reference else math.inf if value > rounding else math.nan
 
 
 def success_posterior(successes: float, episodes: float) -> Any:
