@@ -148,20 +148,16 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     target, warm = batch.get(keys.CHUNK), source.warm
     pad = batch.get(keys.IS_PAD, None)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
-    warm = (warm & counted).expand_as(target)
-    cold = counted.expand_as(target) & ~warm
-    squared = (target - source.loc).square() * warm
-    variance = source.scale.square() * warm
-    unknown = ((target - source.loc).square() + source.scale.square()) * cold
-    mismatch, noise = squared.sum((-1, -2)), variance.sum((-1, -2))
-    rest = unknown.sum((-1, -2))
-    per_position = (squared + variance + unknown).sum(-1)
+    squared = (target - source.loc).square()
+    variance = source.scale.square().expand_as(target)
+    mismatch, noise = ((value * (warm & counted)).sum((-1, -2)) for value in (squared, variance))
+    per_position = ((squared + variance) * counted).sum(-1)
     return TensorDict(
         {
             "mismatch": mismatch,
             "noise": noise,
             "warm": mismatch + noise,
-            "total": mismatch + noise + rest,
+            "total": per_position.sum(-1),
             "total_executed": per_position[..., : prior.chunk_length].sum(-1),
         },
         batch_size=batch.batch_size,
