@@ -109,6 +109,14 @@ def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_
     assert len(training.buffer) == 0
 
 
+def test_rewards_discounted_inside_chunks_are_refused(tmp_path):
+    """They would be discounted again, and the offset of rewards not at all."""
+    training = make_training(tmp_path, env={"gamma": 0.9})
+    with raises(ValueError, "gamma"):
+        training.run()
+    assert len(training.buffer) == 0 and not training.state_path.exists()
+
+
 def test_bad_recipes():
     for name, value in {
         **{"algorithm": "sac", "delta": 0.0, "warmup_steps": 0, "gamma": 1.5, "noise_critic_steps": 0},

@@ -1,5 +1,6 @@
 """ChunkStep against closed-form returns for random episode lengths, horizons and discounts."""
 
+import math
 from functools import partial
 
 import pytest
@@ -87,9 +88,9 @@ def test_specs(prediction):
     assert env.observation_spec["executed_steps"].dtype == torch.int64
 
 
-def test_bad_lengths():
+def test_bad_numbers():
     lengths = {"execute": (4, 0, 2.5), "prediction_length": (2,), "chunk_length": (0, -1)}
-    for name, values in lengths.items():
+    for name, values in (lengths | {"gamma": (1.5, -0.1, math.nan)}).items():
         for value in values:
             with raises(ValueError, name, value):
                 ChunkStep(**{"chunk_length": 3, name: value})

@@ -26,7 +26,8 @@ from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.training.checkpoint import RunState, as_key, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate
-from warmprior.training.parallel import watched
+from warmprior.training.parallel import transforms_of, watched
+from warmprior.transforms.chunk import ChunkStep
 
 
 class ReplaySegments:
@@ -133,8 +134,7 @@ class PriorSpaceTraining:
         collect: Callable[..., AbstractContextManager[Iterator[TensorDictBase]]] | None = None,
     ) -> None:
         self.actor, self.make_env, self.config = actor, make_env, config
-        self.collect = collect
-        self.directory = Path(directory)
+        self.directory, self.collect = Path(directory), collect
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
@@ -170,7 +170,7 @@ class PriorSpaceTraining:
         Raises:
             KeyError: if the environment has no anchor.
             ValueError: if the environment does not fit the policy, executes fewer than ``H`` actions of a
-                chunk, or has an observation of several entries.
+                chunk, discounts inside chunks, or has an observation of several entries.
             FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
                 the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
@@ -201,6 +201,12 @@ class PriorSpaceTraining:
                 raise ValueError(
                     f"agents read vectors, and {key!r} has several entries: append EncodeObservation(actor), "
                     "and train around actor.replace(observation_key=keys.FEATURES)"
+                )
+            steps = [part for part in transforms_of(evaluation_env) if isinstance(part, ChunkStep)]
+            if any(step.gamma != 1 for step in steps):
+                raise ValueError(
+                    "rewards are discounted inside chunks, but here once per decision, after reward_offset: "
+                    "leave gamma out of policy_transforms"
                 )
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
@@ -22,7 +22,7 @@ from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
-from warmprior.training.parallel import base_of, watched
+from warmprior.training.parallel import base_of, transforms_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
 from warmprior.transforms.chunk import ChunkStep
@@ -318,27 +318,26 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
             )
     if keys.EXECUTED not in present or keys.ACTIONS not in present:
         raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
+    parts = list(transforms_of(env))
+    for part in parts:
+        if isinstance(part, ChunkStep) and part.execute > 1:
+            told = dict.fromkeys(rewards, "sum" if part.gamma == 1 else "discounted sum")
+            told |= {part.success: "any", **part.measures}
+            for key, how in asked.items():
+                if (has := told.get(key, "last")) != how:
+                    raise ValueError(
+                        f"after a chunk, {key!r} is the {has} of its steps, but the evaluation asks for the "
+                        f"{how}: give policy_transforms the same success and measures, and gamma=1"
+                    )
     normalizer = getattr(policy, "normalizer", None)
-    if isinstance(base_of(env), SerialEnv | ParallelEnv):
-        normalizer = None  # transforms inside workers cannot be inspected
-    scalings: dict[NestedKey, Any] = {}
-    while isinstance(env, TransformedEnv):
-        for part in env.transform.modules():
-            if isinstance(part, ChunkStep) and part.execute > 1:
-                told = dict.fromkeys(rewards, "sum" if part.gamma == 1 else "discounted sum")
-                told |= {part.success: "any", **part.measures}
-                for key, how in asked.items():
-                    if (has := told.get(key, "last")) != how:
-                        raise ValueError(
-                            f"after a chunk, {key!r} is the {has} of its steps, but the evaluation asks for "
-                            f"the {how}: give policy_transforms the same success and measures, and gamma=1"
-                        )
-            elif isinstance(part, ActionScaling):
-                scalings[part.in_keys_inv[0]] = part
-            elif isinstance(part, ObservationNorm):
-                scalings[part.in_keys[0]] = part
-        env = env.base_env
-    for key in () if normalizer is None else normalizer.keys:
+    if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
+        return  # transforms inside workers cannot be inspected
+    scalings = {
+        (part.in_keys_inv or part.in_keys)[0]: part
+        for part in parts
+        if isinstance(part, ActionScaling | ObservationNorm)
+    }
+    for key in normalizer.keys:
         for name in ("loc", "scale"):
             value = getattr(normalizer, name)(key)
             if key not in scalings or not torch.equal(getattr(scalings[key], name).to(value), value):

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 
+from torch import nn
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
@@ -59,6 +60,13 @@ def parallel_env(
     ]
     # No shared buffers: with them the parent polls, and takes a core from the workers.
     return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+
+
+def transforms_of(env: EnvBase) -> Iterator[nn.Module]:
+    """Yield all transforms of an environment and their parts, but those inside its workers."""
+    while isinstance(env, TransformedEnv):
+        yield from env.transform.modules()
+        env = env.base_env
 
 
 def base_of(env: EnvBase) -> EnvBase:

@@ -22,7 +22,7 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_between, check_whole_numbers
 from warmprior.modules.normalize import FloatNorm
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
@@ -169,8 +169,8 @@ class ChunkStep(EnvTransform):
             environment need different keys.
 
     Raises:
-        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, an action is not a vector,
-            or there are not as many chunk keys as action keys.
+        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, ``gamma`` is not in [0, 1],
+            an action is not a vector, or there are not as many chunk keys as action keys.
         KeyError: if ``action_keys`` are not exactly the environment's actions.
         RuntimeError: (at the first reset) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
@@ -208,6 +208,7 @@ class ChunkStep(EnvTransform):
         execute = chunk_length if execute is None else execute
         prediction_length = chunk_length if prediction_length is None else prediction_length
         check_whole_numbers(chunk_length=chunk_length, execute=execute)
+        check_between(0, 1, gamma=gamma)
         if not execute <= chunk_length <= prediction_length:
             lengths = f"{execute}, {chunk_length} and {prediction_length}"
             raise ValueError(f"need execute <= chunk_length <= prediction_length, got {lengths}")
