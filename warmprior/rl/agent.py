@@ -107,9 +107,8 @@ class PriorSpaceConfig:
         check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
         check_positive(gamma=self.gamma, tau=self.tau, **given(delta=self.delta))
         check_between(0, 1, gamma=self.gamma, tau=self.tau)
-        counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
-        sizes = ("noise_critic_steps", "hidden_dim", "num_layers")
-        names = (*counts, *sizes, "evaluate_every", "evaluation_episodes")
+        names = ["environment_steps", "warmup_steps", "nfe", "updates", "noise_critic_steps", "batch_size"]
+        names += ["hidden_dim", "num_layers", "evaluate_every", "evaluation_episodes"]
         check_whole_numbers(**{name: getattr(self, name) for name in names})
         if self.warmup_steps > self.environment_steps:
             raise ValueError(

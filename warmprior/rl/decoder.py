@@ -247,19 +247,14 @@ class ResidualSampler(Drawing, TensorDictModuleBase):
     ) -> None:
         super().__init__()
         sigma = residual_sigma(decoder)
-        if distribution is None and has_anchor(decoder):
-            distribution = "clipped" if sigma > 0 else "uniform"
-        elif distribution is None:
-            distribution = "normal"
+        if distribution is None:
+            distribution = "normal" if not has_anchor(decoder) else "clipped" if sigma > 0 else "uniform"
         check_choice("distribution", distribution, get_args(ResidualDistribution))
         if distribution != "uniform" and sigma == 0:
             raise ValueError(f"a prior without noise needs 'uniform', got the distribution {distribution!r}")
-        self.distribution = distribution
-        self.sigma = sigma
-        self.delta = decoder.delta
-        self.generator = generator
-        self.in_keys = [keys.ANCHOR]
-        self.out_keys = [keys.DELTA]
+        self.distribution, self.generator = distribution, generator
+        self.sigma, self.delta = sigma, decoder.delta
+        self.in_keys, self.out_keys = [keys.ANCHOR], [keys.DELTA]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the residual."""
