@@ -2,10 +2,12 @@ import pytest
 import torch
 from torchrl.data import Categorical, Unbounded
 from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
-from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing, placed
 from warmprior import PastPrior, policy_transforms
+from warmprior.envs import NavigationEnv
 from warmprior.training import evaluate, play_episode
 
 H = 4
@@ -107,3 +109,54 @@ def test_a_reward_may_be_summed():
     measures = {"reward": "sum"}  # the toy pays t at step t
     for episode in evaluate(POLICY, make_env(), episodes=3, first_seed=0, success="won", measures=measures):
         assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))
+
+
+class Touching(Saying):
+    """Counts contacts at every step, in a type that is too small for their sum."""
+
+    def __init__(self, dtype):
+        super().__init__()
+        self.dtype_ = dtype
+        self.observation_spec["contacts"] = Unbounded((1,), dtype=dtype)
+
+    def _seen(self, out):
+        contacts = 1 if self.dtype_ == torch.bool else 100
+        return super()._seen(out).set("contacts", torch.tensor([contacts]).to(self.dtype_))
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.float64])
+@pytest.mark.parametrize("place", PLACES)
+def test_sums_do_not_stay_in_the_type_of_their_terms(place, dtype):
+    measures, each = {"contacts": "sum"}, 1 if dtype == torch.bool else 100
+
+    def transforms():
+        return policy_transforms(PastPrior(H), observation_steps=1, success="won", measures=measures)
+
+    with closing(placed(place, transforms, (1, 1), lambda length: Touching(dtype))) as env:
+        check_env_specs(env)
+        played = evaluate(POLICY, env, episodes=3, first_seed=0, success="won", measures=measures)
+        for episode in played:
+            assert episode.measures["contacts"] == each * length(episode.seed)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+def test_a_success_keeps_its_type(dtype):
+    class Telling(Saying):
+        def __init__(self):
+            super().__init__()
+            self.observation_spec["won"] = Unbounded((1,), dtype=dtype)
+
+        def _seen(self, out):
+            said = super()._seen(out)
+            return said.set("won", said["won"].to(dtype))
+
+    env = make_env(Telling())
+    check_env_specs(env)
+    assert_by_hand(play_episode(POLICY, env, 0, success="won", measures=HOW))
+
+
+def test_states_of_an_environment_are_no_measures():
+    """A chunk would leave its largest height where the next step reads the last one."""
+    transforms = policy_transforms(PastPrior(H), observation_steps=1, measures={"height": "max"})
+    with raises(ValueError, "height", "another key"):
+        TransformedEnv(NavigationEnv(), transforms).reset()

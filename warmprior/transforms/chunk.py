@@ -162,8 +162,8 @@ class ChunkStep(EnvTransform):
         gamma: discount per control step.
         success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
             ignored if the environment does not write it.
-        measures: further keys, each with ``"max"``, ``"sum"`` or ``"last"``: how its values over the executed
-            steps become one per chunk.
+        measures: further keys, but states, each with ``"max"``, ``"sum"`` or ``"last"``: how its values over
+            the executed steps become one per chunk. Sums of flags and whole numbers are int64.
         action_keys: keys of the environment's actions, vectors ``[*B, d_a]``.
         chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]``. Policies that act in the same
             environment need different keys.
@@ -260,10 +260,11 @@ class ChunkStep(EnvTransform):
                     "ChunkStep needs one reward and a root 'done', the environment has "
                     f"rewards {rewards} and done keys {dones}"
                 )
-            if rewards[0] in self.measures:
+            taken = {rewards[0], *parent.state_spec.keys(True, True)}
+            if names := [key for key in self.measures if unravel_key(key) in taken]:
                 raise ValueError(
-                    f"measures of ChunkStep cannot include the reward {rewards[0]!r}, which after a chunk is "
-                    "its return: have the environment write it under another key as well"
+                    f"measures of ChunkStep cannot include {names}, a chunk's return or what the next step "
+                    "reads: have the environment write it under another key as well"
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
@@ -360,7 +361,7 @@ class ChunkStep(EnvTransform):
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
         if next_tensordict.get(self.success, None) is not None:
             flags = torch.stack([result.get(self.success) for result in results])
-            next_tensordict.set(self.success, flags.any(0))
+            next_tensordict.set(self.success, flags.any(0).to(flags.dtype))
         for key, how in self.measures.items():
             values = [result.get(key) for result in results]
             if how == "max":
@@ -393,6 +394,9 @@ class ChunkStep(EnvTransform):
         self._inner_step()  # raises errors before the first step, and exists before a step is compiled
         shape = (*tensordict_reset.batch_size, 1)
         executed = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
+        for key in self._summed(tensordict_reset):
+            value = tensordict_reset.get(key)
+            tensordict_reset.set(key, value.to(torch.promote_types(value.dtype, torch.int64)))
         return tensordict_reset.set(keys.EXECUTED, executed)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -427,8 +431,15 @@ class ChunkStep(EnvTransform):
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the number of executed steps."""
-        observation_spec[keys.EXECUTED] = Unbounded(
-            (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
-        )
+        """Add the number of executed steps; sums may leave the bounds, and the type, of their terms."""
+        like = {"dtype": torch.int64, "device": observation_spec.device}
+        observation_spec[keys.EXECUTED] = Unbounded((*observation_spec.shape, 1), **like)
+        for key in self._summed(observation_spec):
+            leaf = observation_spec[key]
+            like["dtype"] = torch.promote_types(leaf.dtype, torch.int64)
+            observation_spec[key] = Unbounded(leaf.shape, **like)
         return observation_spec
+
+    def _summed(self, place: TensorDictBase | TensorSpec) -> list[NestedKey]:
+        present = place.keys(True, True)
+        return [key for key, how in self.measures.items() if how == "sum" and key in present]
