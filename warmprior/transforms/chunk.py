@@ -327,10 +327,7 @@ class ChunkStep(EnvTransform):
             (chunk,) = chunks.values()
             results = late(current, next_tensordict, chunk[..., 1 : self.execute, :], reward_key)
             next_tensordict = results[-1]
-        earned = [result.get(reward_key) for result in results]
         ran = [alive] * len(results)  # which rows made each of these steps
-        steps = torch.full(batch, len(results), dtype=torch.int64, device=next_tensordict.device)
-        steps = steps if alive is None else alive.long()
         for i in range(len(results), self.execute):
             done = next_tensordict.get("done")
             if done.any():
@@ -343,19 +340,23 @@ class ChunkStep(EnvTransform):
             for key, chunk in chunks.items():
                 inputs.set(key, chunk[..., i, :])
             result = step(inputs, alive, last=i == self.execute - 1)
-            reward = result.get(reward_key)
-            if alive is None:
-                next_tensordict = result
-                steps += 1
-            else:
-                reward = torch.where(expand_as_right(alive, reward), reward, 0)
+            if alive is not None:
                 # Rows that a simulator has restarted show its current state: at the end, a fresh reset.
                 but = self._shown() if step.restarts.native else ()
-                next_tensordict = rows_where(alive, result, next_tensordict, but)
-                steps += alive
-            earned.append(reward)
+                result = rows_where(alive, result, next_tensordict, but)
+            next_tensordict = result
             ran.append(alive)
-            results.append(next_tensordict)
+            results.append(result)
+
+        def terms(key: NestedKey) -> list[Tensor]:
+            """Return the values of all steps, 0 in the rows that did not make one."""
+            pairs = ((result.get(key), rows) for result, rows in zip(results, ran, strict=True))
+            return [v if rows is None else torch.where(expand_as_right(rows, v), v, 0) for v, rows in pairs]
+
+        reward = self._return(terms(reward_key))
+        steps = torch.zeros(batch, dtype=torch.int64, device=next_tensordict.device)
+        for rows in ran:
+            steps += 1 if rows is None else rows
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
@@ -363,17 +364,11 @@ class ChunkStep(EnvTransform):
             flags = torch.stack([result.get(self.success) for result in results])
             next_tensordict.set(self.success, flags.any(0).to(flags.dtype))
         for key, how in self.measures.items():
-            values = [result.get(key) for result in results]
-            if how == "max":
-                next_tensordict.set(key, torch.stack(values).amax(0))
-                continue
-            counted = [
-                value if rows is None else torch.where(expand_as_right(rows, value), value, 0)
-                for rows, value in zip(ran, values, strict=True)
-            ]
-            next_tensordict.set(key, torch.stack(counted).sum(0))
-        next_tensordict.set(reward_key, self._return(earned))
-        next_tensordict.set(keys.EXECUTED, steps.unsqueeze(-1))
+            if how == "sum":
+                next_tensordict.set(key, torch.stack(terms(key)).sum(0))
+            else:
+                next_tensordict.set(key, torch.stack([result.get(key) for result in results]).amax(0))
+        next_tensordict.set(reward_key, reward).set(keys.EXECUTED, steps.unsqueeze(-1))
         self._remember_ends(next_tensordict, [keys.EXECUTED, self.success, *self.measures])
         return next_tensordict
 
