@@ -117,9 +117,7 @@ class PriorSpaceConfig:
 
     def box(self, actor: WarmPriorActor) -> float:
         """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
-        if self.delta is not None:
-            return self.delta
-        return 0.5 if has_anchor(actor) else 1.5
+        return self.delta or (0.5 if has_anchor(actor) else 1.5)
 
 
 class WarmUpSwitch(TensorDictModuleBase):

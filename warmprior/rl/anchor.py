@@ -113,31 +113,28 @@ class PriorAnchor(EnvTransform):
 
     def __init__(self, actor: Any, *, cold: Literal["noise", "zero"] | None = None) -> None:
         super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
-        if cold is not None:
-            check_choice("cold", cold, ("noise", "zero"))
         # Copies, so that moving the environment does not move the policy's own.
         self.prior, self.start = (
             copy.deepcopy(part).cpu().requires_grad_(False) if isinstance(part, nn.Module) else part
             for part in (actor.prior, actor.start)
         )
         self.moves = has_anchor(actor)
-        self.cold = cold or ("noise" if self.moves else "zero")
+        self.cold = ("noise" if self.moves else "zero") if cold is None else cold
+        check_choice("cold", self.cold, ("noise", "zero"))
         self.observation_key, self.history_key = actor.observation_key, actor.history_key
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(self.history_key, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
+        anchor = torch.zeros_like(forecast)
         if self.cold == "noise":
             # Drawn on the CPU, so that a seed gives the same noise on every device.
-            cold = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
-        else:
-            cold = torch.zeros_like(forecast)
-        anchor = cold
+            anchor = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
         if self.moves:
             with torch.no_grad():
                 mean, valid = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
-            anchor = torch.where(valid, mean, cold)
+            anchor = torch.where(valid, mean, anchor)
         return next_tensordict.set(keys.ANCHOR, anchor)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

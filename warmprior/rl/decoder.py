@@ -102,11 +102,8 @@ class PriorDecoder(TensorDictModuleBase):
         chunk_shape = (self.prediction_length, self.action_dim or anchor.shape[-1])
         check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
         check_shape(str(keys.DELTA), delta, anchor.shape)
-        noise = anchor + delta
-        noise_key, chunk_key = self.out_keys
-        inputs = tensordict.select(*self.in_keys).set(noise_key, noise)
-        chunk = self.ode(inputs, nfe=self.nfe).get(chunk_key)
-        return tensordict.set(noise_key, noise).set(chunk_key, chunk)
+        inputs = tensordict.select(self.observation_key).set(self.out_keys[0], anchor + delta)
+        return tensordict.update(self.ode(inputs, nfe=self.nfe).select(*self.out_keys))
 
     def check_env(self, env: EnvBase) -> None:
         """Check that the policy's chunks have the length and width that an environment takes.

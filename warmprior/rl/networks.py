@@ -76,15 +76,9 @@ class _Trunk(nn.Module):
         scales: Mapping[NestedKey, float],
     ) -> None:
         super().__init__()
-        check_whole_numbers(
-            prediction_length=chunk[0],
-            action_dim=chunk[1],
-            observation_steps=observation[0],
-            observation_dim=observation[1],
-            hidden_dim=hidden_dim,
-            num_layers=num_layers,
-            out_features=out_features,
-        )
+        names = ("prediction_length", "action_dim", "observation_steps", "observation_dim")
+        check_whole_numbers(**dict(zip(names, (*chunk, *observation), strict=True)))
+        check_whole_numbers(hidden_dim=hidden_dim, num_layers=num_layers, out_features=out_features)
         if not in_keys:
             raise ValueError("in_keys is empty: the first is the observation")
         self.scales = [scales.get(unravel_key(key), 1.0) for key in in_keys]

@@ -65,10 +65,8 @@ class ReplaySegments:
         for index in range(self.committed):
             advice = "Restore it, or choose another output folder"
             tensors, _ = load_state(self._path(index), "part of the replay buffer", advice)
-            part = TensorDict(batch_size=[len(next(iter(tensors.values())))])
-            for name, value in tensors.items():
-                part.set(as_key(json.loads(name)), value)
-            parts.append(part)
+            values = {as_key(json.loads(name)): value for name, value in tensors.items()}
+            parts.append(TensorDict(values, [len(next(iter(values.values())))]))
         return torch.cat(parts) if parts else None
 
 

@@ -243,8 +243,7 @@ def evaluate(
     check_whole_numbers(episodes=episodes)
     if len(env.batch_size) > 1:
         raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
-    options: dict[str, Any] = {"nfe": nfe, "policy_seed": policy_seed, "success": success}
-    options["measures"] = measures or {}
+    options: Any = {"nfe": nfe, "policy_seed": policy_seed, "success": success, "measures": measures or {}}
     seeds = range(first_seed, first_seed + episodes)
     played = (play_episode(policy, env, seed, **options) for seed in seeds)
     if env.batch_size:
@@ -332,11 +331,8 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
         return  # transforms inside workers cannot be inspected
-    scalings = {
-        (part.in_keys_inv or part.in_keys)[0]: part
-        for part in parts
-        if isinstance(part, ActionScaling | ObservationNorm)
-    }
+    scalers = [part for part in parts if isinstance(part, ActionScaling | ObservationNorm)]
+    scalings: dict[NestedKey, Any] = {(part.in_keys_inv or part.in_keys)[0]: part for part in scalers}
     for key in normalizer.keys:
         for name in ("loc", "scale"):
             value = getattr(normalizer, name)(key)

@@ -212,11 +212,8 @@ class ChunkStep(EnvTransform):
         if not execute <= chunk_length <= prediction_length:
             lengths = f"{execute}, {chunk_length} and {prediction_length}"
             raise ValueError(f"need execute <= chunk_length <= prediction_length, got {lengths}")
-        self.chunk_length = chunk_length
-        self.execute = execute
-        self.prediction_length = prediction_length
-        self.gamma = gamma
-        self.success = unravel_key(success)
+        self.chunk_length, self.execute, self.prediction_length = chunk_length, execute, prediction_length
+        self.gamma, self.success = gamma, unravel_key(success)
         self.measures = {key: how for key, how in (measures or {}).items() if how != "last"}
         self._input: TensorDictBase | None = None
         self._inner: tuple[Any, InnerStep, LateTransforms | None, NestedKey] | None = None
