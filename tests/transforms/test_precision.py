@@ -77,6 +77,22 @@ def test_environments_keep_their_precision(prior_class, env_class, network):
     assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
 
 
+@pytest.mark.parametrize("network", [torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("env_class", [CountingEnv, DoubleEnv])
+def test_a_cast_policy_acts_in_the_precision_of_its_environment(env_class, network):
+    class Strict(env_class):
+        def _step(self, tensordict):
+            assert tensordict["action"].dtype == self.action_spec.dtype
+            return super()._step(tensordict)
+
+    actor = actor_of(PastPrior(H), torch.float32).replace(normalizer=Normalizer.fit(steps(torch.float32)))
+    env = TransformedEnv(Strict(7), policy_transforms(actor.to(network)))
+    check_env_specs(env)
+    rollout = env.rollout(5, actor, break_when_any_done=False)
+    for key in ("observation", ("history", "actions"), ("vla_action", "chunk")):
+        assert rollout[key].dtype == env.base_env.action_spec.dtype, key
+
+
 def test_batches_come_to_the_network():
     """As memory-mapped data to a GPU; "meta" stands for a device that other tensors cannot meet."""
     prior = PastPrior(H)

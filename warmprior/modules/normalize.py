@@ -153,8 +153,7 @@ class Normalizer(RawUnits):
                     f'each with keys=, such as ("{key}", "state")'
                 )
             check_finite_steps(key, data[key])
-        low = {key: data[key].amin(0).clone() for key in keys}
-        high = {key: data[key].amax(0).clone() for key in keys}
+        low, high = ({key: f(data[key], 0).clone() for key in keys} for f in (torch.amin, torch.amax))
         for key, unit in (units or {}).items():
             middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
             half = torch.where(unit > 0, unit.to(half), half)
@@ -201,7 +200,9 @@ class Normalizer(RawUnits):
         """
         transforms: list[Transform] = []
         for key in self.keys:
-            loc, scale = self.loc(key).clone(), self.scale(key).clone()
+            # Not in the precision of a policy that was cast to doubles, which would reach the simulator.
+            usual = torch.get_default_dtype()
+            loc, scale = (f(key).to(usual, copy=True) for f in (self.loc, self.scale))
             if key == action_key:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
