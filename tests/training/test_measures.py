@@ -1,3 +1,5 @@
+from functools import partial
+
 import pytest
 import torch
 from torchrl.data import Categorical, Unbounded
@@ -8,7 +10,7 @@ from tests.errors import raises
 from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing, placed
 from warmprior import PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
-from warmprior.training import evaluate, play_episode
+from warmprior.training import evaluate, parallel_env, play_episode
 
 H = 4
 HOW = {"high": "max", "effort": "sum", "left": "last"}
@@ -103,6 +105,12 @@ def test_what_a_chunk_would_hide_from_an_episode_is_refused(batched):
         single = policy_transforms(PastPrior(H), observation_steps=1, execute=1, **options)
         base = SerialEnv(2, Saying) if batched else Saying()
         evaluate(POLICY, TransformedEnv(base, single), episodes=2, first_seed=0, **asked)
+
+
+def test_chunks_inside_of_numbered_workers_are_looked_at_too():
+    env = parallel_env(lambda **numbers: Saying(), partial(policy_transforms, PastPrior(H)), 2)
+    with closing(env), raises(ValueError, "won", "policy_transforms"):
+        evaluate(POLICY, env, episodes=2, first_seed=0, success="won")
 
 
 def test_a_reward_may_be_summed():

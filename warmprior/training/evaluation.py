@@ -70,8 +70,7 @@ class _Tally:
 
     def __init__(self, success: NestedKey, measures: Measures) -> None:
         self._success_key, self._how = success, measures
-        self._solved, self._steps = False, 0
-        self._values: dict[str, float] = {}
+        self._solved, self._steps, self._values = False, 0, dict[str, float]()
         self._decisions: list[TensorDictBase] = []
 
     def add(self, after: TensorDictBase, decision: TensorDictBase) -> None:
@@ -82,8 +81,7 @@ class _Tally:
         for key, how in self._how.items():
             value = float(after[key])
             before = self._values.get(key, value if how == "max" else 0.0)
-            combined = {"max": max(before, value), "sum": before + value, "last": value}
-            self._values[key] = combined[how]
+            self._values[key] = {"max": max(before, value), "sum": before + value, "last": value}[how]
 
     def episode(self, seed: int) -> Episode:
         """Return the finished episode."""

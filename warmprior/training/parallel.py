@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from typing import Any
 
 from torch import nn
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
@@ -25,6 +26,7 @@ class _StridedEnv(ParallelEnv):
     """Environments whose workers number their own episodes, see :func:`parallel_env`."""
 
     strided_seeds = True
+    make_transforms: Callable[[], Compose]
 
 
 def parallel_env(
@@ -59,14 +61,18 @@ def parallel_env(
         for i in range(num_envs)
     ]
     # No shared buffers: with them the parent polls, and takes a core from the workers.
-    return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+    env = _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+    env.make_transforms = make_transforms
+    return env
 
 
 def transforms_of(env: EnvBase) -> Iterator[nn.Module]:
-    """Yield all transforms of an environment and their parts, but those inside its workers."""
+    """Yield all transforms of an environment and their parts, but those that only its workers know."""
     while isinstance(env, TransformedEnv):
         yield from env.transform.modules()
         env = env.base_env
+    if isinstance(env, _StridedEnv):
+        yield from env.make_transforms().modules()
 
 
 def base_of(env: EnvBase) -> EnvBase:
@@ -88,6 +94,11 @@ def watched(env: EnvBase) -> Iterator[None]:
     # TorchRL closes the other processes when it finds a dead worker, and closed ones raise ValueError.
     closed_by_torchrl = suppress(ValueError)
 
+    def each(call: Callable[[Any], object]) -> None:
+        for worker in workers:
+            with closed_by_torchrl:
+                call(worker)
+
     def look() -> None:
         nonlocal dead
         ended = []
@@ -103,9 +114,7 @@ def watched(env: EnvBase) -> Iterator[None]:
         while not finished.wait(0.5):
             look()
             if dead:
-                for worker in workers:
-                    with closed_by_torchrl:
-                        worker.terminate()  # closes the pipes that the parent waits on
+                each(lambda worker: worker.terminate())  # closes the pipes that the parent waits on
                 return
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -114,21 +123,16 @@ def watched(env: EnvBase) -> Iterator[None]:
         yield
     except BaseException as error:
         if isinstance(error, (ConnectionError, EOFError)):
-            for worker in workers:  # TorchRL may notice before the process is reaped
-                with closed_by_torchrl:
-                    worker.join(0.2)
+            each(lambda worker: worker.join(0.2))  # TorchRL may notice before the process is reaped
         look()
         finished.set()
         # Without this, idle workers would keep the interpreter from exiting.
         try:
             env.close(raise_if_closed=False)
         except Exception:  # closing fails if workers are dead
-            for worker in workers:
-                with closed_by_torchrl:
-                    worker.terminate()
+            each(lambda worker: worker.terminate())
         if dead:
-            advice = "run one environment in this process to see its own error"
-            raise worker_died(dead, advice) from error
+            raise worker_died(dead, "run one environment in this process to see its own error") from error
         raise
     finally:
         finished.set()

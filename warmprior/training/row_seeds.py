@@ -33,6 +33,5 @@ def _has_offset(make_env: object) -> bool:
     # Looked up here and not in the workers, because a worker without the attribute dies.
     if not isinstance(make_env, partial):
         return False
-    return bool(make_env.keywords.get("seed_offset")) or any(
-        _has_offset(inner) for inner in (make_env.func, *make_env.args, *make_env.keywords.values())
-    )
+    inner = (make_env.func, *make_env.args, *make_env.keywords.values())
+    return bool(make_env.keywords.get("seed_offset")) or any(map(_has_offset, inner))
