@@ -120,6 +120,20 @@ def test_the_state_after_an_end_may_be_nan():
     torch.testing.assert_close(*losses)
 
 
+def test_padded_rows_count_nowhere():
+    """As `split_trajectories` pads: such rows have a False mask, and any values."""
+    loss, data = build(), batch()
+    data["collector", "mask"] = torch.arange(N) % 2 == 0
+    other = data.clone()
+    other["next", "reward"][1::2] = 1e3
+    results = []
+    for one in (data, other):
+        torch.manual_seed(5)
+        results.append(loss(one))
+    assert (results[0] == results[1]).all()
+    torch.testing.assert_close(results[0]["td_error"], data["td_error"][::2].mean())
+
+
 @pytest.mark.parametrize("discount", ["step", "decision"])
 def test_decisions_that_multistep_joins_are_refused(discount):
     """TorchRL's transform keeps the first decision's end and executed steps."""

@@ -265,8 +265,9 @@ class DSRLNALoss(LossModule):
         loss_actor = alpha * log_prob - self._values(value).amin(0)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
-        diagnostics = {"alpha": alpha, "entropy": -log_prob.detach().mean(), "td_error": td_error.mean()}
-        return self._finish(losses, tensordict, weights).update(diagnostics)
+        result = self._finish(losses, tensordict, weights).set("alpha", alpha)
+        diagnostics = {"entropy": -log_prob.detach(), "td_error": td_error}
+        return result.update(self._finish(diagnostics, tensordict, None))
 
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
@@ -338,10 +339,8 @@ class DSRLNALoss(LossModule):
     def _finish(
         self, losses: dict[str, Tensor], tensordict: TensorDictBase, weights: Tensor | None
     ) -> TensorDict:
-        reduced = {
-            name: self._reduce_loss(loss, tensordict=tensordict, weights=weights)
-            for name, loss in losses.items()
-        }
+        options: Any = {"tensordict": tensordict, "weights": weights}
+        reduced = {name: self._reduce_loss(loss, **options) for name, loss in losses.items()}
         check_finite(reduced)
         return TensorDict(reduced, batch_size=[])
 
