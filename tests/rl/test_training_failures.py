@@ -3,7 +3,7 @@ import torch
 
 from tests.errors import raises
 from tests.rl.training_parts import ALGORITHMS, H, from_step, make_actor, make_config, make_env, make_training
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
 from warmprior.io.files import exclusive
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
@@ -107,6 +107,12 @@ def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_
     with raises(ValueError, 2, 3):
         training.run()
     assert len(training.buffer) == 0
+
+
+def test_a_network_without_sizes_is_named(tmp_path):
+    actor = WarmPriorActor(torch.nn.Linear(2, 2), PastPrior(H))
+    with raises(TypeError, "Linear", "action_dim", "VelocityNetwork"):
+        make_training(tmp_path, actor)
 
 
 def test_rewards_discounted_inside_chunks_are_refused(tmp_path):

@@ -154,15 +154,14 @@ class PriorSpaceAgent:
         drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        frozen: Any = actor.network
-        sizes = {
-            "action_dim": frozen.action_dim,
-            "observation_dim": frozen.observation_dim,
-            "prediction_length": actor.prior.prediction_length,
-            "observation_steps": frozen.observation_steps,
-            "hidden_dim": config.hidden_dim,
-            "num_layers": config.num_layers,
-        }
+        names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
+        sizes: dict[str, Any] = {name: getattr(actor.network, name, None) for name in names}
+        if missing := [name for name, size in sizes.items() if size is None]:
+            kind = type(actor.network).__name__
+            raise TypeError(
+                f"an agent needs the policy's {', '.join(missing)}: make {kind} a VelocityNetwork"
+            )
+        sizes |= {"hidden_dim": config.hidden_dim, "num_layers": config.num_layers}
         network = make_prior_space_actor(
             **sizes,
             delta=self.decoder.delta,

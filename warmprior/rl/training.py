@@ -96,6 +96,7 @@ class PriorSpaceTraining:
         curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
+        TypeError: if the policy's network does not tell its sizes, as a :class:`VelocityNetwork` does.
         ValueError: if the recipe does not fit the policy, or the folder's state belongs to another recipe,
             policy or wiring.
 
