@@ -1,13 +1,16 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from lab.tasks import navigation_task
 from tests.errors import raises
+from tests.toy_env import demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior
 from warmprior.deploy import AsyncExecutor
 from warmprior.modules import PreconditionedNetwork
@@ -56,6 +59,18 @@ def test_gradients_that_rollouts_hold_make_no_difference():
         options = {"network": NETWORK, "training": CONFIG, "description": None}
         policies.append(train_policy(steps, PastPrior(4), **options))
     assert equal(*policies)
+
+
+def test_a_replay_buffer_that_has_overwritten_steps_is_refused():
+    """It holds the end of its last episode before the middle of it."""
+    steps = demonstrations(length=60)
+    for room, refused in ((60, False), (50, True)):
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(room))
+        for part in steps.split(20):
+            buffer.extend(part)
+        options = {"network": NETWORK, "training": CONFIG, "description": None}
+        with raises(ValueError, "storage") if refused else nullcontext():
+            train_policy(buffer, PastPrior(4), **options)
 
 
 BARS = """

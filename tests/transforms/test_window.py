@@ -115,6 +115,8 @@ def test_data_that_cannot_be():
     ):
         with raises(error, fact):
             ActionWindow(wrong, 2)
+    with raises(ValueError, "order"):
+        ActionWindow(pieces, 2)
 
 
 @pytest.mark.parametrize("bad", [0, 777, 1999])

@@ -155,9 +155,6 @@ def train_policy(
     if not isinstance(prior, Prior):
         raise TypeError(f"the prior must be an object such as PastPrior(8), got {prior!r}")
     check_device(device)  # before the demonstrations are read
-    place = isinstance(demonstrations, str | Path)
-    if not place and (observation_keys is not None or image_keys):
-        raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
     if isinstance(demonstrations, str | Path):
         task = Task.open(
             demonstrations,
@@ -165,9 +162,13 @@ def train_policy(
             observation_keys=observation_keys,
             image_keys=image_keys,
         )
+    elif observation_keys is not None or image_keys:
+        raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
     elif isinstance(demonstrations, Task):
         task = demonstrations
     elif isinstance(demonstrations, TensorDictBase | ReplayBuffer):
+        if getattr(demonstrations, "write_count", 0) > len(demonstrations):
+            raise ValueError("the replay buffer holds its last steps first: give its storage room for all")
         steps_of = demonstrations if isinstance(demonstrations, TensorDictBase) else demonstrations[:]
         task = Task.of("demonstrations", steps_of)
     else:

@@ -161,7 +161,8 @@ def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
     if len(values.unique()) != len(values):
         repeated = values.sort().values
         repeated = repeated[1:][repeated[1:] == repeated[:-1]]
-        raise ValueError(f"the steps of episode {int(repeated[0])} are not contiguous")
+        number = int(repeated[0])
+        raise ValueError(f"the steps of episode {number} are not contiguous: order all by episode and time")
     last = lengths.cumsum(0) - 1
     first = last - lengths + 1
     return first.repeat_interleave(lengths), last.repeat_interleave(lengths)
