@@ -69,6 +69,20 @@ def test_jumps_between_chunks_that_hold_still_are_infinitely_larger():
     assert math.isnan(smoothness(rollout_of(chunks, [1, 1, 1])).jump_ratio)  # nothing inside a chunk
 
 
+@pytest.mark.parametrize("decisions", [1, 2, 5])
+def test_rows_of_a_collector_may_be_joined(decisions):
+    """As `data.reshape(-1)` does, whose rows begin without an end before them."""
+    chunks = torch.randn(3, decisions, 2, 2, generator=torch.Generator().manual_seed(0))
+    rollout = rollout_of(chunks, [[2] * decisions] * 3)
+    rollout["collector", "traj_ids"] = torch.arange(3)[:, None].expand(3, decisions).clone()
+    if decisions == 1:
+        with raises(ValueError, "chunk boundary"):
+            smoothness(rollout.reshape(-1))
+        return
+    one, other = smoothness(rollout), smoothness(rollout.reshape(-1))
+    assert vars(one) == pytest.approx(vars(other), nan_ok=True)
+
+
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
     with raises(KeyError, "ChunkStep"):

@@ -48,7 +48,8 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     Args:
         rollout: decisions ``[*B, D]``, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside, ``("next", "done")``;
-            if chunks take effect late, also the delay that :class:`InferenceDelay` writes.
+            if chunks take effect late, also the delay that :class:`InferenceDelay` writes. Rows of a
+            collector may be joined, since it numbers episodes.
 
     Returns:
         The actions ``[*B, T, d_a]``, padded with NaN where a row executed fewer than the longest; the index
@@ -85,8 +86,10 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     delay = rollout.get(keys.DELAY, None)
     if delay is not None:  # actions before a chunk took effect belong to the decision before
         decision = decision - (position < delay).long()
-    ended = done.squeeze(-1).long()
-    episode = (ended.cumsum(-1) - ended).unsqueeze(-1).expand_as(kept)
+    ended = done.squeeze(-1).clone()
+    if (number := rollout.get(("collector", "traj_ids"), None)) is not None:  # rows may have been joined
+        ended[..., :-1] |= number.reshape(ended.shape).diff(dim=-1) != 0
+    episode = (ended.cumsum(-1) - ended.long()).unsqueeze(-1).expand_as(kept)
     kept = kept.flatten(-2)
     # Stable sorting brings the executed actions of every row to its front, in order.
     order = (~kept).long().argsort(dim=-1, stable=True)[..., : int(kept.sum(-1).max())]
@@ -127,14 +130,11 @@ def smoothness(rollout: TensorDictBase) -> Smoothness:
     if not boundary.any():
         raise ValueError("the rollout has no chunk boundary: it needs two decisions in one episode")
     jump = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
-    jerk = math.nan
-    if actions.shape[-2] > 3:
-        third = torch.linalg.vector_norm(actions.diff(n=3, dim=-2), dim=-1)
-        jerk = _mean(third, together[..., 2:] & together[..., 1:-1] & together[..., :-2])
+    third = torch.linalg.vector_norm(actions.diff(n=3, dim=-2), dim=-1)
     return Smoothness(
         boundary_jump=_mean(jump, boundary),
         inner_jump=_mean(jump, together & ~boundary),
-        jerk=jerk,
+        jerk=_mean(third, together[..., 2:] & together[..., 1:-1] & together[..., :-2]),
         boundaries=int(boundary.sum()),
     )
 
