@@ -7,14 +7,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import TransformedEnv
 
 from lab.tasks import navigation_task
 from tests.errors import raises
-from tests.toy_env import demonstrations
-from warmprior import ChiTransformer, HistoryObservation, PastPrior
+from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
+from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
 from warmprior.deploy import AsyncExecutor
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, load_policy, train_policy
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
@@ -59,6 +60,27 @@ def test_gradients_that_rollouts_hold_make_no_difference():
         options = {"network": NETWORK, "training": CONFIG, "description": None}
         policies.append(train_policy(steps, PastPrior(4), **options))
     assert equal(*policies)
+
+
+@pytest.fixture
+def doubles():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_scripts_in_double_precision_train_and_play(doubles, tmp_path, dtype):
+    steps = demonstrations(d_o=2 + ACTION_DIM).apply(
+        lambda value: value.to(dtype) if value.ndim > 1 else value
+    )
+    options = {"network": NETWORK, "training": CONFIG, "description": None}
+    policy = train_policy(steps, PastPrior(4), tmp_path, **options)
+    assert {value.dtype for value in policy.state_dict().values()} == {torch.float64}
+    env = TransformedEnv(CountingEnv(5), policy_transforms(policy))
+    assert env.rollout(3, policy)["vla_action", "chunk"].dtype == torch.float64
+    torch.set_default_dtype(torch.float32)  # as another script, which loads it
+    assert equal(policy, load_policy(tmp_path / "policy_000008"))
 
 
 def test_a_replay_buffer_that_has_overwritten_steps_is_refused():

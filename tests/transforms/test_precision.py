@@ -89,7 +89,7 @@ def test_a_cast_policy_acts_in_the_precision_of_its_environment(env_class, netwo
     env = TransformedEnv(Strict(7), policy_transforms(actor.to(network)))
     check_env_specs(env)
     rollout = env.rollout(5, actor, break_when_any_done=False)
-    for key in ("observation", ("history", "actions"), ("vla_action", "chunk")):
+    for key in (("history", "actions"), ("vla_action", "chunk")):
         assert rollout[key].dtype == env.base_env.action_spec.dtype, key
 
 

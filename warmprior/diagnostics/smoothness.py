@@ -75,9 +75,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     steps = rollout.get(needed[1])
     if rollout.ndim < 1 or rollout.batch_size.numel() == 0:
         raise ValueError(f"a rollout is [*B, D] with D > 0 decisions, got {tuple(rollout.shape)}")
-    done = rollout.get(("next", "done"), None)
-    if done is None:
-        done = torch.zeros_like(steps, dtype=torch.bool)
+    done = rollout.get(("next", "done"), torch.zeros_like(steps, dtype=torch.bool))
     longest = int(steps.max())
     chunk = executed_chunk(rollout)[..., :longest, :]
     position = torch.arange(longest, device=chunk.device)

@@ -40,6 +40,13 @@ class FloatNorm(ObservationNorm):
         return super().transform_observation_spec(observation_spec)
 
 
+class FloatScaling(ActionScaling):
+    """TorchRL's transform, in the precision of the actions and not in that of the statistics."""
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        return super()._inv_apply_transform(action).to(action.dtype)
+
+
 def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
     """Raise ValueError unless values ``[*B, d]`` have the width of their statistics ``[d]``."""
     if shape[len(shape) - loc.ndim :] != loc.shape:
@@ -200,11 +207,9 @@ class Normalizer(RawUnits):
         """
         transforms: list[Transform] = []
         for key in self.keys:
-            # Not in the precision of a policy that was cast to doubles, which would reach the simulator.
-            usual = torch.get_default_dtype()
-            loc, scale = (f(key).to(usual, copy=True) for f in (self.loc, self.scale))
+            loc, scale = self.loc(key).clone(), self.scale(key).clone()
             if key == action_key:
-                transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
+                transforms.append(FloatScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
                 transforms.append(FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
         return transforms
@@ -216,9 +221,8 @@ class Normalizer(RawUnits):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Normalizer:
         """Return an unfitted normaliser with the keys and shapes of :meth:`config`, to load buffers into."""
-        zero: dict[NestedKey, Tensor] = {}
-        for key, shape in config["shapes"]:
-            zero[tuple(key) if isinstance(key, list) else key] = torch.zeros(shape)
+        shapes = ((tuple(key) if isinstance(key, list) else key, shape) for key, shape in config["shapes"])
+        zero: dict[NestedKey, Tensor] = {key: torch.zeros(shape) for key, shape in shapes}
         return cls(zero, zero)
 
 

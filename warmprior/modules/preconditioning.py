@@ -104,7 +104,7 @@ class SourceMoments(nn.Module):
         trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
-        """Estimate moments, as float32, from unpadded positions of training windows and draws of the prior.
+        """Estimate moments from unpadded positions of training windows and draws of the prior.
 
         A position that is padded in all windows gets the moments of independent standard normal ends; no loss
         reads it.
@@ -157,7 +157,7 @@ class SourceMoments(nn.Module):
         c = mean((a0 - m0) * (a1 - m1))
         unpadded = (count > 0).expand_as(m0)
         v0, v1 = (torch.where(unpadded, value, 1.0) for value in (v0, v1))
-        return cls(*(value.float() for value in (m0, m1, v0, v1, c)))
+        return cls(*(value.to(torch.get_default_dtype()) for value in (m0, m1, v0, v1, c)))
 
 
 class PreconditionedNetwork(VelocityNetwork):

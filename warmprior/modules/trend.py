@@ -190,7 +190,7 @@ class PoseTrend(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ) -> PoseTrend:
-        """Estimate a trend, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
+        """Estimate a trend from unpadded positions of windows ``[N]`` and draws of the prior.
 
         The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
         draws the source samples, on the windows' device.
@@ -206,7 +206,7 @@ class PoseTrend(nn.Module):
         deviation = resting.unsqueeze(1) - (weight * resting.unsqueeze(1)).sum(0)
         variance = (weight * deviation.square()).sum(0)
         slopes = (weight * deviation * ends).sum(1) / variance.clamp_min(VARIANCE_FLOOR)
-        return cls(rest, centre.float(), *slopes.float())
+        return cls(rest, *(value.to(torch.get_default_dtype()) for value in (centre, *slopes)))
 
     def config(self) -> dict[str, Any]:
         """Return the arguments of :meth:`zero` as JSON holds them; the values themselves are buffers."""

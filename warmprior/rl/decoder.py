@@ -102,7 +102,8 @@ class PriorDecoder(TensorDictModuleBase):
         chunk_shape = (self.prediction_length, self.action_dim or anchor.shape[-1])
         check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
         check_shape(str(keys.DELTA), delta, anchor.shape)
-        inputs = tensordict.select(self.observation_key).set(self.out_keys[0], anchor + delta)
+        noise = anchor + delta.to(anchor.dtype)  # the chunk is in the environment's precision
+        inputs = tensordict.select(self.observation_key).set(self.out_keys[0], noise)
         return tensordict.update(self.ode(inputs, nfe=self.nfe).select(*self.out_keys))
 
     def check_env(self, env: EnvBase) -> None:

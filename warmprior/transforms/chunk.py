@@ -23,7 +23,7 @@ from torchrl.envs.transforms import (
 
 from warmprior import keys
 from warmprior.checks import check_between, check_whole_numbers
-from warmprior.modules.normalize import FloatNorm
+from warmprior.modules.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
@@ -35,6 +35,7 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
     ActionScaling: lambda transform: 1,
     CameraImages: lambda transform: 1,
     FloatNorm: lambda transform: 1,
+    FloatScaling: lambda transform: 1,
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
 }
