@@ -201,8 +201,7 @@ class PriorSpaceTraining:
                     f"agents read vectors, and {key!r} has several entries: append EncodeObservation(actor), "
                     "and train around actor.replace(observation_key=keys.FEATURES)"
                 )
-            steps = [part for part in transforms_of(evaluation_env) if isinstance(part, ChunkStep)]
-            if any(step.gamma != 1 for step in steps):
+            if any(isinstance(part, ChunkStep) and part.gamma != 1 for part in transforms_of(evaluation_env)):
                 raise ValueError(
                     "rewards are discounted inside chunks, but here once per decision, after reward_offset: "
                     "leave gamma out of policy_transforms"

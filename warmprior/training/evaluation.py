@@ -302,11 +302,8 @@ def _play_batched(
 def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, measures: Measures) -> None:
     """Raise an error if a policy cannot act in an environment, or that does not tell what is asked for."""
     check_usual_keys(policy, "evaluate")
-    asked, present, rewards = (
-        {success: "any", **measures},
-        env.observation_spec.keys(True, True),
-        env.reward_keys,
-    )
+    asked, rewards = {success: "any", **measures}, env.reward_keys
+    present = env.observation_spec.keys(True, True)
     for key in asked:
         if key not in present and key not in rewards:
             raise KeyError(
@@ -323,8 +320,8 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
             for key, how in asked.items():
                 if (has := told.get(key, "last")) != how:
                     raise ValueError(
-                        f"after a chunk, {key!r} is the {has} of its steps, but the evaluation asks for the "
-                        f"{how}: give policy_transforms the same success and measures, and gamma=1"
+                        f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: "
+                        "give policy_transforms the same success and measures, and gamma=1"
                     )
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
