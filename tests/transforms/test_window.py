@@ -1,5 +1,7 @@
 """Training windows against loops in plain Python and against TorchRL's own sequence sampler."""
 
+import warnings
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -72,6 +74,16 @@ def test_random_episodes(lengths, horizon, further, longer, observation_steps, n
     sizes = {"prediction_length": horizon + further, "history_length": horizon + longer}
     window = ActionWindow(data, horizon, observation_steps=observation_steps, **sizes)
     check(window(every_step(data)), data, window)
+
+
+def test_episodes_that_are_too_short_for_a_warm_source_are_named():
+    """The field would be trained from cold sources alone, and meet warm ones where it acts."""
+    with pytest.warns(UserWarning, match="more than 4 steps.*never warm"):
+        window_replay_buffer(steps([3, 4]), PastPrior(4), batch_size=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert window_replay_buffer(steps([3, 5]), PastPrior(4), batch_size=2)
+        assert window_replay_buffer(steps([3, 4]), PreviewPrior(4), batch_size=2)
 
 
 def test_without_withholding_nothing_is_drawn_but_the_steps():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torchrl.envs.transforms import Compose, Transform
 from warmprior import keys
 from warmprior.checks import check_finite_steps, check_keys, check_whole_numbers
 from warmprior.history import window_history
-from warmprior.modules.prior import Prior
+from warmprior.modules.prior import PastPrior, Prior
 from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
 
@@ -256,6 +257,9 @@ def window_replay_buffer(
     windows = window_transforms(data, prior, generator=generator, **options)
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
+    if isinstance(prior, PastPrior) and (reach := int((frames - window.start).max())) < prior.chunk_length:
+        words = f"no episode has more than {reach + 1} steps, so {prior} is never warm: shorten the chunk"
+        warnings.warn(words, stacklevel=2)
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator must be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
