@@ -6,7 +6,7 @@ from types import ModuleType
 import h5py
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 
 from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
@@ -197,6 +197,8 @@ def test_data_that_cannot_be_are_named():
     for name, changed, error, *facts in (
         ("own", {"episode": None}, KeyError, "own", "['episode']"),
         ("own", {"action": torch.zeros(40)}, ValueError, "own", "'action'", "(40,)"),
+        ("own", {"action": torch.zeros(40, 1) + 1j}, ValueError, "own", "'action'", "complex64"),
+        ("own", {"episode": NonTensorStack(*map(str, range(40)))}, ValueError, "own", "'episode'", "text"),
         ("own", {"observation": torch.full((40, 3), math.nan)}, ValueError, "observation"),
         ("../own", {}, ValueError, "'../own'"),
     ):

@@ -193,13 +193,14 @@ def evaluate(
     Args:
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
             followed by a :class:`~warmprior.PriorDecoder`; it is set to evaluation mode.
-        env: a :class:`Task`, or an environment with the policy's transforms. A single environment plays one
-            episode after another, see :func:`play_episode`. A batched environment ``[n]`` plays ``n`` at a
-            time, and the noise of an episode depends on ``n``. Batched environments are those of
-            :func:`parallel_env`, any ``SerialEnv`` or ``ParallelEnv`` (each environment is seeded separately,
-            and must start the same episode after every ``set_seed(seed)``), and those of a class with
-            ``strided_seeds = True``. After ``set_seed(seed, static_seed=True)``, row ``i`` of the last kind
-            plays the episodes ``seed + i``, ``seed + i + n``, ...
+        env: a :class:`Task`, or an environment with the policy's transforms that ends every episode
+            (``StepCounter`` sets a time limit). A single environment plays one episode after another, see
+            :func:`play_episode`. A batched environment ``[n]`` plays ``n`` at a time, and the noise of an
+            episode depends on ``n``. Batched environments are those of :func:`parallel_env`, any
+            ``SerialEnv`` or ``ParallelEnv`` (each environment is seeded separately, and must start the same
+            episode after every ``set_seed(seed)``), and those of a class with ``strided_seeds = True``. After
+            ``set_seed(seed, static_seed=True)``, row ``i`` of the last kind plays the episodes ``seed + i``,
+            ``seed + i + n``, ...
 
     Keyword Args:
         episodes: number of episodes; episode ``e`` starts from simulator seed ``first_seed + e``.

@@ -135,15 +135,13 @@ class Task:
                         f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, but images must "
                         "be uint8 [N, 3, size, size], of one size for all cameras: crop or resize them"
                     )
-        for key in (vector, ACTION):
-            if data[key].ndim != 2:
-                raise ValueError(f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]")
-        episode = data[EPISODE]
-        if episode.ndim != 1 or episode.is_floating_point() or bool((episode < 0).any()):
-            raise ValueError(
-                f"{EPISODE!r} of {name} must count the demonstrations, integers [N] from 0 on, got "
-                f"{episode.dtype} {tuple(episode.shape)}"
-            )
+        for key, shape in ((vector, "[N, d]"), (ACTION, "[N, d]"), (EPISODE, "[N]")):
+            value = data[key]
+            found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else "text"
+            if found == "text" or value.is_complex() or value.ndim != len(shape.split()):
+                raise ValueError(f"{key!r} of {name} must be real numbers {shape}, got {found}")
+        if data[EPISODE].is_floating_point() or bool((data[EPISODE] < 0).any()):
+            raise ValueError(f"{EPISODE!r} of {name} must be whole numbers from 0 on, got {found}")
         normalizer = Normalizer.fit(data, (vector, ACTION))
         data = normalizer.normalize(data.select(OBSERVATION, ACTION, EPISODE))
         return cls(
