@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from leaderboard import DOOR, SCRIPTED, pairs, standings, trials
+from leaderboard import SCRIPTED, pairs, standings, trials
 from pages import own_best
 from pandas import DataFrame
 from results import GROUPS, LONG, SHORT, TEN, TWENTY_FIVE, WARM
@@ -18,12 +18,6 @@ from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
 def whole(number: float) -> int:
     """Return the number as tables round it."""
     return int(f"{number + 1e-6:.0f}")
-
-
-def common(numbers: list[float]) -> int:
-    """Return the one value that all numbers round to."""
-    (value,) = {whole(number) for number in numbers}
-    return value
 
 
 def span(numbers: list[float]) -> str:
@@ -92,11 +86,6 @@ def sentences() -> dict[str, list[str]]:
         for s in (GAUSSIAN, PAST)
     ]
     door = {nfe: {s: whole(solved("door_20000", s, nfe)) for s in (GAUSSIAN, *WARM)} for nfe in (9, 3, 1)}
-    rows = read_played("door_20000")
-    best = {
-        nfe: {s: whole(100 * outcomes.mean()) for s, outcomes in own_best(rows[rows["nfe"] == nfe]).items()}
-        for nfe in (9, 1)
-    }
     loss = [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in (GAUSSIAN, *WARM)]
     pusht = {
         count: {s: solved(run, s, 9) for s in (GAUSSIAN, *WARM)}
@@ -179,9 +168,6 @@ def sentences() -> dict[str, list[str]]:
             f"({won_at_best} : {lost_at_best})",
             f"WP-Past at nine steps, with 25 ({pair(['pusht_25'], PAST, 9)}) "
             f"and with 50 ({pair(['pusht_50'], PAST, 9)})",
-            f"({best[9][GAUSSIAN]}%; WP-Past and WP-Preview {common([best[9][PAST], best[9][PREVIEW]])})",
-            f"correlated noise solves {best[1][CORRELATED]}% and the Gaussian source {best[1][GAUSSIAN]}",
-            f"({whole(mip[DOOR])} against {max(n for at in door.values() for n in at.values())}%)",
         ],
         "results.md": [
             f"There WP-Past solves {transport[3]}% on transport and the Gaussian source "
