@@ -351,22 +351,22 @@ class ChunkStep(EnvTransform):
             pairs = ((result.get(key), rows) for result, rows in zip(results, ran, strict=True))
             return [v if rows is None else torch.where(expand_as_right(rows, v), v, 0) for v, rows in pairs]
 
-        reward = self._return(terms(reward_key))
-        steps = torch.zeros(batch, dtype=torch.int64, device=next_tensordict.device)
-        for rows in ran:
-            steps += 1 if rows is None else rows
+        # Combined before they are written, because the result of the last step is written into.
+        whole = {reward_key: self._return(terms(reward_key))}
+        told = next_tensordict.get(self.success, None) is not None
+        for key, how in ({self.success: "max", **self.measures} if told else self.measures).items():
+            if how == "sum":
+                whole[key] = torch.stack(terms(key)).sum(0)
+            else:
+                whole[key] = torch.stack([result.get(key) for result in results]).amax(0)
+        masks = [rows for rows in ran if rows is not None]
+        steps = torch.full(batch, len(ran) - len(masks), dtype=torch.int64, device=next_tensordict.device)
+        whole[keys.EXECUTED] = sum(masks, steps).unsqueeze(-1)
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
-        if next_tensordict.get(self.success, None) is not None:
-            flags = torch.stack([result.get(self.success) for result in results])
-            next_tensordict.set(self.success, flags.any(0).to(flags.dtype))
-        for key, how in self.measures.items():
-            if how == "sum":
-                next_tensordict.set(key, torch.stack(terms(key)).sum(0))
-            else:
-                next_tensordict.set(key, torch.stack([result.get(key) for result in results]).amax(0))
-        next_tensordict.set(reward_key, reward).set(keys.EXECUTED, steps.unsqueeze(-1))
+        for key, value in whole.items():
+            next_tensordict.set(key, value)
         self._remember_ends(next_tensordict, [keys.EXECUTED, self.success, *self.measures])
         return next_tensordict
 
