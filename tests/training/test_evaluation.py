@@ -364,6 +364,12 @@ def test_policy_and_environment_need_one_normaliser():
     for env in (
         TransformedEnv(SeededEnv(), Compose(*transforms)),
         TransformedEnv(TransformedEnv(SeededEnv(), transforms[1].clone()), StepCounter()),
+        # The environment's own units, below, are its own.
+        TransformedEnv(
+            TransformedEnv(SeededEnv(), Compose(*other.env_transforms())),
+            transforms[1].clone(),
+            auto_unwrap=False,
+        ),
     ):
         assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
     # Of observations alone.

@@ -3,7 +3,7 @@ from functools import partial
 import pytest
 import torch
 from torchrl.data import Categorical, Unbounded
-from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
@@ -117,6 +117,31 @@ def test_a_reward_may_be_summed():
     measures = {"reward": "sum"}  # the toy pays t at step t
     for episode in evaluate(POLICY, make_env(), episodes=3, first_seed=0, success="won", measures=measures):
         assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))
+
+
+def test_a_flag_of_success_may_be_counted_too():
+    """Over the steps of a chunk, of which the last must not say yet that any succeeded."""
+    measures = {"won": "sum"}
+    transforms = policy_transforms(PastPrior(H), observation_steps=1, success="won", measures=measures)
+    env = TransformedEnv(SerialEnv(2, Saying), transforms)
+    for episode in evaluate(POLICY, env, episodes=5, first_seed=0, success="won", measures=measures):
+        said = [values(episode.seed, t)["won"] for t in range(1, length(episode.seed) + 1)]
+        assert (episode.measures["won"], episode.success) == (sum(said), any(said))
+
+
+def test_what_tells_of_whole_decisions_may_be_combined_in_any_way():
+    """And a success is the largest of its flags."""
+    measures = {"step_count": "max", "episode_reward": "max", "executed_steps": "sum", "won": "max"}
+    env = make_env().append_transform(StepCounter()).append_transform(RewardSum())
+    steps, said = length(1), play_episode(POLICY, env, 1, success="won", measures=measures)
+    assert said.measures == {
+        "step_count": 2, "episode_reward": steps * (steps + 1) / 2, "executed_steps": steps, "won": 1
+    }  # fmt: skip
+    measures = {"executed_steps": "sum", "won": "max"}
+    transforms = partial(policy_transforms, PastPrior(H), observation_steps=1, success="won")
+    with closing(parallel_env(lambda **numbers: Saying(), transforms, 1)) as env:
+        (said,) = evaluate(POLICY, env, episodes=1, first_seed=1, success="won", measures=measures)
+    assert said.measures == {"executed_steps": steps, "won": 1}
 
 
 class Touching(Saying):

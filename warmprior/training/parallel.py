@@ -67,11 +67,11 @@ def parallel_env(
 
 
 def transforms_of(env: EnvBase) -> Iterator[nn.Module]:
-    """Yield all transforms of an environment and their parts, but those that only its workers know."""
-    while isinstance(env, TransformedEnv):
+    """Yield an environment's transforms and their parts, innermost first, but those only its workers know."""
+    if isinstance(env, TransformedEnv):
+        yield from transforms_of(env.base_env)
         yield from env.transform.modules()
-        env = env.base_env
-    if isinstance(env, _StridedEnv):
+    elif isinstance(env, _StridedEnv):
         yield from env.make_transforms().modules()
 
 
