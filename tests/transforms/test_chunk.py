@@ -160,3 +160,11 @@ def test_an_event_at_any_executed_step_is_one_of_the_chunk(place):
     rollout = TransformedEnv(Events(), ChunkStep(3, success="bell")).rollout(3, ones(3))
     assert rollout["next", "bell"].flatten().tolist() == [False, True, False]
     assert rollout["next", "success"].flatten().tolist() == [False, False, True]
+
+
+def test_a_row_that_rests_is_not_stepped_when_another_ends():
+    env = TransformedEnv(SerialEnv(2, [partial(CountingEnv, n) for n in (3, 9)]), ChunkStep(4))
+    data = ones(4)(env.reset())
+    stepped = env.step(data.set("_step", torch.tensor([True, False])))["next"]
+    assert stepped["observation"][:, 0].tolist() == [3, 0]
+    assert stepped["executed_steps"].flatten().tolist() == [3, 0]
