@@ -47,6 +47,7 @@ GROUPS = {TEN: ("scripted_10",), TWENTY_FIVE: ("scripted_25",), MANY: LONG}
 LENGTHS = {  # demonstrations whose runs differ in the length of training
     f"square, {MANY}": (SHORT[0], LONG[0]),
     f"transport, {MANY}": (SHORT[1], LONG[1]),
+    "can, 25 of six operators": ("can_mh_25_10000", "can_mh_25_80000"),
     "door, 25 human": ("door_20000", "door_80000"),
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),
 }
@@ -108,8 +109,10 @@ def steps() -> None:
 
 def iterations() -> None:
     """Draw chart C: success against the length of the training."""
-    picture, axes = figure(WIDTH, 6.6, 2, "Success against the length of the training", rows=2)
-    for axis, (name, runs) in zip(axes, LENGTHS.items(), strict=True):
+    picture, axes = figure(WIDTH, 9.4, 2, "Success against the length of the training", rows=3)
+    for spare in axes[len(LENGTHS) :]:
+        spare.remove()
+    for axis, (name, runs) in zip(axes, LENGTHS.items(), strict=False):
         cells = read_cells(runs, common_seeds=True)
         cells = cells[cells["source"].isin((GAUSSIAN, *WARM))]
         # The same episodes were played at every NFE.

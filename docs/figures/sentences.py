@@ -100,6 +100,10 @@ def sentences() -> dict[str, list[str]]:
         s: f"{whole(two_seeds_of('door_20000', s))} to {whole(two_seeds_of('door_80000', s))}"
         for s in (GAUSSIAN, PAST)
     }
+    can = {
+        s: " to ".join(str(whole(solved(f"can_mh_25_{length}", s, 1))) for length in (10000, 80000))
+        for s in (GAUSSIAN, PAST)
+    }
     best_mean = {s: whole(board.loc[s, 9]["best noise"]) for s in (GAUSSIAN, PAST)}
     (won, lost), mip_pair, mip_beside_past, past_once = (
         frame.loc[setting]
@@ -149,6 +153,7 @@ def sentences() -> dict[str, list[str]]:
             f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (one seed)",
             f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
             f"solves {whole(mip['Push-T, 206'])}% with 206",
+            f"at one step {can[GAUSSIAN]}%, and {can[PAST]} (one seed)",
             f"the Gaussian source then solves {transport[2]}% at one step in place of {transport[0]}, "
             f"and WP-Past {transport[3]} in place of {transport[1]}",
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
@@ -170,7 +175,7 @@ def sentences() -> dict[str, list[str]]:
             f"and with 50 ({pair(['pusht_50'], PAST, 9)})",
         ],
         "results.md": [
-            f"There WP-Past solves {transport[3]}% on transport and the Gaussian source "
+            f"WP-Past solves {transport[3]}% on transport and the Gaussian source "
             f"{transport[2]}, where they solve {transport[1]} and {transport[0]} after 10,000",
             f"({pair(LONG, CORRELATED, 9)} at nine steps, {pair(LONG, CORRELATED, 3)} at three, "
             f"{pair(LONG, CORRELATED, 1)} at one)",
