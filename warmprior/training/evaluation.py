@@ -301,7 +301,7 @@ def _play_batched(
 
 
 def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, measures: Measures) -> None:
-    """Raise an error if a policy cannot act in an environment, or that does not tell what is asked for."""
+    """Raise an error if a policy cannot act in an environment, or that lacks what is asked for."""
     check_usual_keys(policy, "evaluate")
     asked, rewards = {success: "max", **measures}, env.reward_keys
     present = env.observation_spec.keys(True, True)
@@ -316,12 +316,12 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
     parts = list(transforms_of(env))
     for part in parts:
         if isinstance(part, ChunkStep) and part.execute > 1:
-            told = dict.fromkeys(rewards, "sum" if part.gamma == 1 else "discounted sum")
-            told |= {part.success: "max", **part.measures}
+            combined = dict.fromkeys(rewards, "sum" if part.gamma == 1 else "discounted sum")
+            combined |= {part.success: "max", **part.measures}
             # What is written after chunks is of whole decisions; inside workers there is no parent to ask.
             below = {*rewards, *(part.parent or env).observation_spec.keys(True, True)}
             for key in asked.keys() & below - {keys.EXECUTED}:
-                if (has := told.get(key, "last")) != (how := asked[key]):
+                if (has := combined.get(key, "last")) != (how := asked[key]):
                     raise ValueError(
                         f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: "
                         "give policy_transforms the same success and measures, and gamma=1"

@@ -353,8 +353,8 @@ class ChunkStep(EnvTransform):
 
         # Combined before they are written, because the result of the last step is written into.
         whole = {reward_key: self._return(terms(reward_key))}
-        told = next_tensordict.get(self.success, None) is not None
-        for key, how in ({self.success: "max", **self.measures} if told else self.measures).items():
+        flagged = next_tensordict.get(self.success, None) is not None
+        for key, how in ({self.success: "max", **self.measures} if flagged else self.measures).items():
             if how == "sum":
                 whole[key] = torch.stack(terms(key)).sum(0)
             else:
