@@ -57,7 +57,7 @@ def test_the_gain_is_the_share_that_is_repeated(prior, share):
 
 
 def test_the_gain_is_the_mean_slope_over_dimensions():
-    """What of a dimension appears in another one is none."""
+    """A dimension of the memory gains nothing by what appears in another one."""
     prior, matrix = PastPrior(H), torch.tensor([[1.0, 2.0], [0.0, -0.5]])
     field = policy(lambda t, a, o: a @ matrix.T - a, prior)
     found = memory_gain(field, windows(prior, N), nfes=(1,))

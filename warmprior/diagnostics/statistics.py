@@ -11,8 +11,9 @@ from warmprior.io.extras import require
 
 def ratio(value: float, reference: float) -> float:
     """Return a quotient of numbers >= 0: infinite if only the reference is 0, and NaN if both are."""
-    rounding = 1e-6
-    return value / reference if reference else math.inf if value > rounding else math.nan
+    if reference:
+        return value / reference
+    return math.inf if value > 1e-6 else math.nan  # beyond rounding
 
 
 def success_posterior(successes: float, episodes: float) -> Any:

@@ -301,7 +301,7 @@ def _play_batched(
 
 
 def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, measures: Measures) -> None:
-    """Raise an error if a policy cannot act in an environment, or that lacks what is asked for."""
+    """Raise an error if a policy cannot act in an environment, or if it lacks what is asked for."""
     check_usual_keys(policy, "evaluate")
     asked, rewards = {success: "max", **measures}, env.reward_keys
     present = env.observation_spec.keys(True, True)
