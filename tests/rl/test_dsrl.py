@@ -7,10 +7,19 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from torchrl.modules import TanhNormal
 
 from tests.errors import raises
 from tests.rl.dsrl_parts import GAMMA, H, N, batch, build
-from warmprior import PastPrior, PreviewPrior, PriorDecoder, ResidualSampler, WarmPriorActor, keys
+from warmprior import (
+    BoxTanhNormal,
+    PastPrior,
+    PreviewPrior,
+    PriorDecoder,
+    ResidualSampler,
+    WarmPriorActor,
+    keys,
+)
 
 
 def networks(loss):
@@ -132,6 +141,16 @@ def test_padded_rows_count_nowhere():
         results.append(loss(one))
     assert (results[0] == results[1]).all()
     torch.testing.assert_close(results[0]["td_error"], data["td_error"][::2].mean())
+
+
+def test_an_actor_of_torchrls_own_distribution_is_measured_in_units_of_the_box():
+    results = []
+    for kind in (BoxTanhNormal, TanhNormal):
+        loss = build(delta=1.5)
+        loss.actor_network[-1].distribution_class = kind
+        torch.manual_seed(5)
+        results.append(loss(batch()))
+    torch.testing.assert_close(*results)
 
 
 @pytest.mark.parametrize("discount", ["step", "decision"])

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
@@ -28,7 +28,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
-from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
+from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
 
 
@@ -162,13 +162,8 @@ class PriorSpaceAgent:
                 f"an agent needs the policy's {', '.join(missing)}: make {kind} a VelocityNetwork"
             )
         sizes |= {"hidden_dim": config.hidden_dim, "num_layers": config.num_layers}
-        network = make_prior_space_actor(
-            **sizes,
-            delta=self.decoder.delta,
-            in_keys=self.state_keys,
-            # DSRL-NA converts log-probabilities to units of the box itself, TorchRL's SAC does not.
-            distribution_class=BoxTanhNormal if config.algorithm == "dsrl-sac" else TanhNormal,
-        ).to(self.device)
+        network = make_prior_space_actor(**sizes, delta=self.decoder.delta, in_keys=self.state_keys)
+        network = network.to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
         self.loss = self._make_loss(network, sizes).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)

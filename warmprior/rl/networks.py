@@ -21,9 +21,8 @@ class BoxTanhNormal(TanhNormal):
     r""":class:`~torchrl.modules.TanhNormal` with log-probabilities in units of its box.
 
     For :math:`\Delta \in [-\delta, \delta]^n` they are those of :math:`\Delta / \delta \in [-1, 1]^n`, larger
-    by :math:`n \log \delta`. With it TorchRL's own losses measure entropy as DSRL and
-    :class:`~warmprior.DSRLNALoss` do, for any box: ``make_prior_space_actor(...,
-    distribution_class=BoxTanhNormal)``, with ``SACLoss(..., target_entropy=0.0)`` as in DSRL.
+    by :math:`n \log \delta`. So all losses measure the entropy of :func:`make_prior_space_actor`'s residuals
+    as DSRL does, for any box.
 
     Args:
         loc: see the parent class.
@@ -41,8 +40,8 @@ class BoxTanhNormal(TanhNormal):
     """
 
     def _change_of_units(self) -> Tensor:
-        half = (self.high - self.low) / 2
-        return half.log().expand(self.event_shape).sum()
+        half = (self.high - self.low).double() / 2
+        return half.log().expand(self.event_shape).sum().to(self.loc.dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density of ``value`` in units of the box."""
@@ -123,12 +122,12 @@ def make_prior_space_actor(
     hidden_dim: int = 256,
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
-    distribution_class: type[TanhNormal] = TanhNormal,
 ) -> ProbabilisticActor:
     r"""Return a squashed Gaussian over :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
 
     It has DSRL's network: per layer ``Linear -> LayerNorm -> Tanh``, then location and log standard deviation
-    (clipped to [-20, 2]). The official sizes are 3 layers of 2048 on Square and 128 on Transport.
+    (clipped to [-20, 2]). The official sizes are 3 layers of 2048 on Square and 128 on Transport. Its
+    log-probabilities are in units of the box (:class:`BoxTanhNormal`), whose target entropy is 0 in DSRL.
 
     Args:
         action_dim: ``d_a``.
@@ -142,8 +141,6 @@ def make_prior_space_actor(
             anchor out if it is always zero. Add ``keys.ACTIONS`` if the decoder or the next mean depends on
             more than the anchor: for a network that sees the last actions, and for WP-Past with
             ``execute < H``.
-        distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
-            own losses; :class:`~warmprior.DSRLNALoss` works with either class.
 
     Raises:
         ValueError: if a size is not positive, or ``delta`` is not a finite number > 0.
@@ -168,7 +165,7 @@ def make_prior_space_actor(
         in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
         out_keys=[keys.DELTA],
         spec=Composite({keys.DELTA: Bounded(-delta, delta, chunk)}),
-        distribution_class=distribution_class,
+        distribution_class=BoxTanhNormal,
         # Two event dimensions give one log-probability per chunk, and not per action.
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
         return_log_prob=True,
