@@ -13,6 +13,7 @@ from tests.errors import raises
 from tests.rl.dsrl_parts import GAMMA, H, N, batch, build
 from warmprior import (
     BoxTanhNormal,
+    GaussianPrior,
     PastPrior,
     PreviewPrior,
     PriorDecoder,
@@ -162,15 +163,15 @@ def test_decisions_that_multistep_joins_are_refused(discount):
     build(discount=discount)(joined.set("steps_to_next_obs", torch.ones(N, 1)))
 
 
-@pytest.mark.parametrize("distribution", ["normal", "clipped", "uniform"])
-def test_distillation_by_hand(distribution):
+@pytest.mark.parametrize("prior", [GaussianPrior(H), PastPrior(H), PastPrior(H, sigma=0.0)])
+def test_distillation_by_hand(prior):
     """Head by head, online action critics at decoded draws; the gradient is the noise critics' alone."""
-    loss = build(distillation=distribution)
+    loss = build(prior)
     loss.distillation.generator = torch.Generator().manual_seed(2)
     data = batch()
     _, q, _, q_noise = networks(loss)
-    options = {"distribution": distribution, "generator": torch.Generator().manual_seed(2)}
-    delta = ResidualSampler(loss.decoder, **options)(data.clone())["prior", "delta"]
+    sampler = ResidualSampler(loss.decoder, generator=torch.Generator().manual_seed(2))
+    delta = sampler(data.clone())["prior", "delta"]
     chunk = decode(loss, data["observation"], data["prior", "anchor"] + delta)
     inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
     for critic in q_noise:
@@ -219,14 +220,15 @@ def test_training_reaches_a_known_optimum():
             return torch.zeros_like(a)
 
     decoder = PriorDecoder(WarmPriorActor(Still(), PastPrior(H), nfe=1), delta=0.5)
-    loss = build(decoder=decoder, hidden_dim=64, alpha_init=0.3, distillation="uniform")
+    loss = build(decoder=decoder, hidden_dim=64, alpha_init=0.3)
     loss.log_alpha.requires_grad_(False)
     states = batch()[:1].expand(256).clone()
     states["next", "done"] = torch.ones(256, 1, dtype=torch.bool)
     best = torch.tensor([[0.3, -0.2], [0.0, 0.4]])
     goal = states["prior", "anchor"] + best
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
-    sampler = TensorDictSequential(ResidualSampler(decoder, distribution="uniform"), decoder)
+    everywhere = loss.distillation = ResidualSampler(decoder, distribution="uniform")
+    sampler = TensorDictSequential(everywhere, decoder)
     torch.manual_seed(0)
     for _ in range(300):
         data = sampler(states.clone())

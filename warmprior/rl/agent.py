@@ -26,7 +26,7 @@ from warmprior.checks import (
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
+from warmprior.rl.decoder import PriorDecoder, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
@@ -47,8 +47,6 @@ class PriorSpaceConfig:
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.
-        distillation: distribution of residuals on which the noise critic is trained, see ResidualSampler,
-            DSRL-NA only; by default the clipped source around a mean, and the whole source around zero.
         batch_size: transitions per update.
         learning_rate: learning rate of actor, critics and temperature.
         tau: rate of the target critics' averaging.
@@ -82,7 +80,6 @@ class PriorSpaceConfig:
     nfe: int = 1
     updates: int = 20
     noise_critic_steps: int = 10
-    distillation: ResidualDistribution | None = None
     batch_size: int = 256
     learning_rate: float = 3e-4
     tau: float = 0.005
@@ -101,8 +98,6 @@ class PriorSpaceConfig:
         check_choice("algorithm", self.algorithm, ("dsrl-na", "dsrl-sac"))
         if self.algorithm == "dsrl-sac" and not self.backup_entropy:
             raise ValueError("dsrl-sac has backup_entropy=True; leave it out")
-        if self.algorithm == "dsrl-sac" and self.distillation is not None:
-            raise ValueError("dsrl-sac has no noise critic: leave distillation out")
         check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)
         check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
         check_positive(gamma=self.gamma, tau=self.tau, **given(delta=self.delta))
@@ -151,8 +146,8 @@ class PriorSpaceAgent:
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
-        drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
-        self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
+        around_zero: Any = {} if has_anchor(actor) else {"distribution": "clipped"}
+        self.warmup = TensorDictSequential(ResidualSampler(self.decoder, **around_zero), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
         names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
         sizes: dict[str, Any] = {name: getattr(actor.network, name, None) for name in names}
@@ -185,7 +180,6 @@ class PriorSpaceAgent:
                 self.decoder,
                 discount="decision",
                 noise_critic_steps=config.noise_critic_steps,
-                distillation=config.distillation,
                 backup_entropy=config.backup_entropy,
                 **entropy,
             )

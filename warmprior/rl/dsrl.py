@@ -27,7 +27,7 @@ from warmprior.checks import (
     check_positive,
     check_whole_numbers,
 )
-from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
+from warmprior.rl.decoder import PriorDecoder, ResidualSampler
 from warmprior.rl.networks import BoxTanhNormal
 from warmprior.transforms.inner_step import rows_where
 
@@ -64,7 +64,8 @@ class DSRLNALoss(LossModule):
         L_\pi &= \alpha \log \pi(\Delta | s) - \min_i Q^W_i(s, \Delta), \qquad
         L_\alpha = -\log \alpha \, (\log \pi + \mathcal{H})
 
-    with stopped gradients where SAC has them, and batch means throughout. As in the official implementation,
+    with stopped gradients where SAC has them, and batch means throughout. :math:`q` is the distribution that
+    :class:`~warmprior.ResidualSampler` chooses for the policy. As in the official implementation,
     log-probabilities are in units of the box, :math:`\Delta / \delta \in [-1, 1]`, and time-outs are
     terminations. The defaults are the official ones, except the discount. The official schedule makes several
     updates per step and then distils on separate batches:
@@ -94,8 +95,6 @@ class DSRLNALoss(LossModule):
             ``gamma`` of :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma` for any ``k``, as in
             the official implementation (with undiscounted rewards inside chunks).
         noise_critic_steps: distillation steps per round of :meth:`schedule`.
-        distillation: :math:`q`, see :class:`~warmprior.ResidualSampler`. By default ``"normal"`` around zero,
-            the official one, and ``"clipped"`` around a mean.
         alpha_init: initial temperature.
         target_entropy: :math:`\mathcal{H}`, target of the residual's entropy in units of the box.
 
@@ -166,7 +165,6 @@ class DSRLNALoss(LossModule):
         backup_entropy: bool = True,
         discount: Literal["step", "decision"] = "step",
         noise_critic_steps: int = 10,
-        distillation: ResidualDistribution | None = None,
         alpha_init: float = 1.0,
         target_entropy: float = 0.0,
     ) -> None:
@@ -181,7 +179,7 @@ class DSRLNALoss(LossModule):
         self.discount = discount
         self.noise_critic_steps = noise_critic_steps
         self.reduction = "mean"
-        self.distillation = ResidualSampler(decoder, distribution=distillation)
+        self.distillation = ResidualSampler(decoder)
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(qvalue_network, "qvalue_network", CRITICS, create_target_params=True)
         self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", CRITICS)
