@@ -23,7 +23,7 @@ SIZE = 32
 
 @pytest.fixture(scope="module")
 def lift():
-    env = RobosuiteEnv("lift", horizon=20, camera_size=SIZE, sim_state=True)
+    env = RobosuiteEnv("lift", horizon=20, sim_state=True)
     env.reset()
     return env
 
@@ -46,17 +46,18 @@ def test_pixels_are_those_of_robosuites_own_renderer(lift, monkeypatch):
 def test_episodes_go_on_as_if_nothing_was_rendered():
     actions = torch.rand(6, 7, generator=torch.manual_seed(0)) * 2 - 1
 
-    def states(**options):
-        env = RobosuiteEnv("lift", sim_state=True, **options)
+    def states(*cameras):
+        env = RobosuiteEnv("lift", sim_state=True)
         data, found = env.reset(), []
         for action in actions:
             data = env.step(data.set("action", action))["next"]
             found.append(data["sim_state"])
-            if options:
+            for camera in cameras:
+                env.render_frame(camera, 16)
                 env.render_frame("frontview", 16, found[0].numpy())
         return torch.stack(found)
 
-    assert torch.equal(states(from_pixels=True, camera=CAMERAS, camera_size=16), states())
+    assert torch.equal(states(*CAMERAS), states())
 
 
 @apart
@@ -74,7 +75,7 @@ def test_a_state_is_rendered_as_it_was_when_present(lift):
 @apart
 def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
     """Instead of waiting for OpenGL's threads, which are not there, for ever."""
-    lift.render_frame()
+    lift.render_frame(size=SIZE)
     for size in (SIZE, 16):  # with the renderer that is there, and with a new one
         with raises(RuntimeError, "fork"):
             apart(partial(lift.render_frame, size=size))()

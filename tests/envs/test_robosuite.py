@@ -6,8 +6,9 @@ import torch
 
 pytest.importorskip("robosuite")
 
-from torchrl.envs import ParallelEnv, SerialEnv
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.record import PixelRenderTransform
 
 from lab.scripted.motion import ArmRunner
 from lab.scripted.operators import SKILLED, Demonstrator
@@ -221,7 +222,9 @@ def test_bad_options():
 
 @apart
 def test_pixels(can_render):
-    env = make_lift(from_pixels=True, camera_size=(48, 64))
+    """As TorchRL's transform renders them."""
+    pixels = PixelRenderTransform(render_method="render_frame", camera="agentview", size=(48, 64))
+    env = TransformedEnv(make_lift(), pixels)
     check_env_specs(env)
     pixels = env.rollout(2)["pixels"]
     assert pixels.shape == (2, 48, 64, 3) and pixels.dtype == torch.uint8

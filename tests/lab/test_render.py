@@ -84,13 +84,13 @@ def images_of(path):
 
 @apart
 def replayed(path):
-    env = RobosuiteEnv("lift", camera_size=16, fast_rendering=True)
+    env = RobosuiteEnv("lift", fast_rendering=True)
     env.reset()
     found = {}
     with h5py.File(path) as file:
         for name, demo in file["data"].items():
             for camera in CAMERAS:
-                frames = [env.render_frame(camera, state=state) for state in demo["states"]]
+                frames = [env.render_frame(camera, 16, state) for state in demo["states"]]
                 found[f"{name}/{camera}_image"] = np.stack(frames)
             poses = []
             for state in demo["states"]:

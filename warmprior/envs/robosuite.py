@@ -1,4 +1,4 @@
-"""robosuite environments for TorchRL: the tasks of robomimic, from low-dimensional state or pixels."""
+"""robosuite environments for TorchRL: the tasks of robomimic, from low-dimensional state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warmprior import keys
 from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.control_loop import ControlLoop, StepLoop, is_plain
 from warmprior.envs.env_args import modernize_env_args
-from warmprior.envs.rendering import EnvRenderers, require_rendering
+from warmprior.envs.rendering import EnvRenderers
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
@@ -30,8 +30,6 @@ class RobosuiteEnv(EnvBase):
     key                 shape, dtype
     ==================  =============================================================
     ``"observation"``   ``[d_o]`` float32: ``low_dim_keys``, concatenated
-    ``"pixels"``        ``[h, w, 3]`` uint8, upright; only ``from_pixels``. Several cameras are
-                        nested under their names, as ``("pixels", "agentview")``
     ``"sim_state"``     ``[1 + nq + nv]`` float64, time, positions and velocities; only ``sim_state``
     ``"eef_pose"``      ``[arms, 3, 4]`` float32; only ``eef_pose``
     ``"success"``       ``[1]`` bool
@@ -46,6 +44,10 @@ class RobosuiteEnv(EnvBase):
     (``set_seed(seed, static_seed=True)``), worker ``i`` of a :class:`~torchrl.envs.ParallelEnv` plays every
     ``workers``-th episode. The global generators of numpy and Python are not changed.
 
+    Policies that see images need them only at decisions, for which
+    :class:`~warmprior.transforms.CameraImages` renders them. TorchRL's ``PixelRenderTransform(render_method=
+    "render_frame", camera="agentview")`` renders every step, such as for its ``VideoRecorder``.
+
     Args:
         task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
             package (see :func:`~warmprior.envs.mimicgen.register_mimicgen`).
@@ -58,10 +60,6 @@ class RobosuiteEnv(EnvBase):
         horizon: time limit in control steps; by default the task's, or else the environment's own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`, ``"robosuite"`` for
             ``env.step``; by default the lean loop if it supports robots, sensors and ``env.step``.
-        from_pixels: True renders ``camera`` at every step. Policies that see images need them only at
-            decisions, for which :class:`~warmprior.transforms.CameraImages` renders them.
-        camera: name of the rendered camera, or several; ``None`` for the task's first, or ``"agentview"``.
-        camera_size: side of the image in pixels, or its height and width.
         fast_rendering: see :class:`~warmprior.envs.rendering.CameraRenderer`.
         sim_state: True writes the simulator's state.
         eef_pose: True writes the grippers' poses in the world: rotation and, in the last column, position in
@@ -75,9 +73,8 @@ class RobosuiteEnv(EnvBase):
     Raises:
         ImportError: if robosuite is not installed, or MimicGen is not and the task is one of its tasks.
         ValueError: if the task is unknown, not exactly one of ``task``, ``env_args`` and ``env`` is given, an
-            option is out of range, an observation or camera does not exist, or the lean loop does not support
-            the robots.
-        ImportError: if ``from_pixels`` is True and this machine cannot render.
+            option is out of range, an observation does not exist, or the lean loop does not support the
+            robots.
 
     Examples:
         >>> from warmprior.envs import RobosuiteEnv
@@ -99,9 +96,6 @@ class RobosuiteEnv(EnvBase):
         low_dim_keys: Sequence[str] | None = None,
         horizon: int | None = None,
         control_loop: Literal["lean", "robosuite"] | None = None,
-        from_pixels: bool = False,
-        camera: str | Sequence[str] | None = None,
-        camera_size: int | tuple[int, int] = 84,
         fast_rendering: bool = False,
         sim_state: bool = False,
         eef_pose: bool = False,
@@ -117,9 +111,6 @@ class RobosuiteEnv(EnvBase):
         if control_loop is not None:
             check_choice("control_loop", control_loop, _LOOPS)
         check_whole_numbers(seed_stride=seed_stride, horizon=1 if horizon is None else horizon)
-        size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
-        if len(size) != 2 or min(size) < 1:
-            raise ValueError(f"camera_size must be a side or (height, width), got {camera_size!r}")
         if task is not None:
             env_args = task_env_args(task)
         elif env_args is not None:
@@ -127,13 +118,10 @@ class RobosuiteEnv(EnvBase):
         spec = None if env_args is None else task_of_env(env_args)
         if spec is not None and horizon is None:
             horizon = spec.horizon(style)
-        if camera is None:
-            camera = "agentview" if spec is None else spec.cameras[0]
-        cameras = (camera,) if isinstance(camera, str) else tuple(camera)
-        if not cameras or len(set(cameras)) < len(cameras):
-            raise ValueError(f"camera must be a name, or several different names, got {camera!r}")
         super().__init__(device=device)
         self.task = spec
+        #: The camera that :meth:`render_frame` shows by default: the task's first, or ``"agentview"``.
+        self.camera = "agentview" if spec is None else spec.cameras[0]
         self._env = env if env_args is None else make_simulator(env_args)
         if control_loop is None:
             control_loop = "lean" if is_plain(self._env) else "robosuite"
@@ -146,8 +134,6 @@ class RobosuiteEnv(EnvBase):
         self.low_dim_keys = default if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
         self.control_loop = control_loop
-        self.from_pixels, self.cameras, self.camera_size = from_pixels, cameras, size
-        self.nested_pixels = not isinstance(camera, str)
         self.fast_rendering = fast_rendering
         self.sim_state, self.eef_pose = sim_state, eef_pose
         self.terminate_on_success = terminate_on_success
@@ -164,22 +150,21 @@ class RobosuiteEnv(EnvBase):
     def render_frame(
         self,
         camera: str | None = None,
-        size: int | tuple[int, int] | None = None,
+        size: int | tuple[int, int] = 84,
         state: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return a picture of a state, uint8 ``[h, w, 3]``, upright, with or without ``from_pixels``.
+        """Return a picture of a state, uint8 ``[h, w, 3]``, upright.
 
-        By default the first camera shows the current state in ``camera_size``; a state has the form of
-        ``"sim_state"``. Rendering does not affect the episode.
+        The size is a side, or height and width. By default :attr:`camera` shows the current state; a state
+        has the form of ``"sim_state"``. Rendering does not affect the episode.
 
         Raises:
             ValueError: if the camera does not exist.
             ImportError: if no OpenGL backend works.
         """
-        size = self.camera_size if size is None else size
         height, width = (size, size) if isinstance(size, int) else size
         qpos = None if state is None else state[1 : 1 + self._env.sim.model.nq]
-        return self._renderers.render(camera or self.cameras[0], height, width, qpos)
+        return self._renderers.render(camera or self.camera, height, width, qpos)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the simulator."""
@@ -191,8 +176,6 @@ class RobosuiteEnv(EnvBase):
         #: The control loop, with access to the simulator's state and the poses of bodies and sites.
         self.loop: StepLoop = _LOOPS[self.control_loop](env, self.low_dim_keys)
         self._renderers = EnvRenderers(env, fast=self.fast_rendering)
-        if self.from_pixels:
-            require_rendering()
         width = sum(value.size for value in self.loop.observations().values())
 
         def flag() -> Categorical:
@@ -201,11 +184,6 @@ class RobosuiteEnv(EnvBase):
         self.observation_spec = Composite(
             {keys.OBSERVATION: Unbounded((width,), device=self.device), "success": flag()}
         )
-        if self.from_pixels:
-            shape = (*self.camera_size, 3)
-            pixels = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=self.device)
-            nested = {camera: pixels.clone() for camera in self.cameras}
-            self.observation_spec["pixels"] = Composite(nested) if self.nested_pixels else pixels
         if self.sim_state:
             numbers = len(self.loop.state())
             state = Unbounded((numbers,), dtype=torch.float64, device=self.device)
@@ -222,15 +200,10 @@ class RobosuiteEnv(EnvBase):
         if seed is not None:
             self._seed, self._episode = seed, 0
 
-    def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         # Kept short: it runs between physics steps, which evict everything else from the caches.
         state = [observations[key] for key in self.low_dim_keys]
-        measured: dict[str, Any] = {
-            keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
-        }
-        if self.from_pixels:
-            frames = {camera: self.render_frame(camera) for camera in self.cameras}
-            measured["pixels"] = frames if self.nested_pixels else frames[self.cameras[0]]
+        measured = {keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")}
         if self.sim_state:
             measured[keys.SIM_STATE] = self.loop.state()
         if self.eef_pose:
@@ -247,8 +220,7 @@ class RobosuiteEnv(EnvBase):
         flags["done"] = terminated or truncated
         entry: dict[str, Any] = {"reward": torch.tensor([float(success)])}
         entry |= {name: torch.tensor([flag]) for name, flag in flags.items()}
-        for key, value in self._measure(observations).items():
-            entry[key] = TensorDict(value) if isinstance(value, dict) else torch.from_numpy(value)
+        entry |= {key: torch.from_numpy(value) for key, value in self._measure(observations).items()}
         # The constructor's checks are skipped, because they take longer than all of the above.
         result = TensorDict._new_unsafe(entry, batch_size=torch.Size([]))
         return result if self.device is None else result.to(self.device)

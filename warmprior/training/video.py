@@ -165,7 +165,7 @@ def record_filmstrip(
         renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
         frame, quick = (
             lambda state, size: simulator.render_frame(size=size, state=state),
-            lambda state, size: renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq]),
+            lambda state, size: renderer.render(simulator.camera, size, size, state[1 : 1 + nq]),
         )
         rate = rate or round(1 / loop.env.control_timestep)
     # Inserted first, so that it runs at every control step inside a chunk.

@@ -35,14 +35,11 @@ class RobosuiteGymEnv(gymnasium.Env):
         horizon: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        options: dict[str, Any] = {"style": style, "camera_size": image_size, "horizon": horizon}
-        if cameras:
-            options |= {"camera": list(cameras), "from_pixels": True}
-        self._env = RobosuiteEnv(task, **options)
+        self._env = RobosuiteEnv(task, style=style, horizon=horizon)
         spec = self._env.task
         assert spec is not None  # named tasks have one
         self.task = self.task_description = spec.name
-        self._object_dim, self._cameras = spec.object_dim, list(cameras)
+        self._object_dim, self._cameras, self._image_size = spec.object_dim, list(cameras), image_size
         self._max_episode_steps = spec.horizon(style) if horizon is None else horizon
         self.render_mode = render_mode
         self._begun = False
@@ -91,9 +88,8 @@ class RobosuiteGymEnv(gymnasium.Env):
         observation: dict[str, Any] = {"agent_pos": vector[self._object_dim :]}
         if not self._cameras:
             return {**observation, "environment_state": vector[: self._object_dim]}
-        pixels = data["pixels"]
-        images = {self._cameras[0]: pixels} if torch.is_tensor(pixels) else dict(pixels.items())
-        return {**observation, "pixels": {name: image.numpy() for name, image in images.items()}}
+        images = {camera: self._env.render_frame(camera, self._image_size) for camera in self._cameras}
+        return {**observation, "pixels": images}
 
 
 @EnvConfig.register_subclass("warmprior_robosuite")
