@@ -251,7 +251,7 @@ def _allocate(
         FRAME: (torch.int64, ()),
     }
     # Expanded scalars take no memory, and the real memory is allocated once.
-    data = TensorDict(batch_size=[steps])
+    data = TensorDict(batch_size=[steps], device="cpu")
     for key, (dtype, width) in widths.items():
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
     needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
@@ -414,13 +414,9 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         as_recorded: bool = False,
         storage: Literal["memory", "memmap"] = "memory",
         scratch_dir: str | Path | None = None,
-        device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
         check_choice("storage", storage, ("memory", "memmap"))
-        device = torch.device(device)
-        if storage == "memmap" and device.type != "cpu":
-            raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         chosen: dict[str, Any] = {"filter_key": filter_key, "observation_keys": observation_keys}
         chosen |= {"image_keys": image_keys, "poses": absolute_actions, "demos": demos}
         with ExitStack() as stack:
@@ -441,7 +437,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         #: The number of demos read.
         self.num_episodes = len(index.demos)
         super().__init__(
-            storage=TensorStorage(data if storage == "memmap" else data.to(device)),
+            storage=TensorStorage(data),
             writer=ImmutableDatasetWriter(),
             **kwargs,
         )

@@ -41,15 +41,14 @@ class RobomimicDemonstrations(DemonstrationReplay):
         as_recorded: True reads such poses without ``absolute_actions`` too, as stored in the file.
         storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default temporary ones.
         scratch_dir: a folder for memory maps.
-        device: device of the tensors in memory.
         **kwargs: TorchRL's ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` and
             ``generator``.
 
     Raises:
         FileNotFoundError: if there is no such file.
         DatasetError: if the file is invalid; the message names the demo and key.
-        ValueError: if ``storage`` is unknown or does not fit ``device``, or ``absolute_actions`` is True for
-            a controller without pose deltas.
+        ValueError: if ``storage`` is unknown, or ``absolute_actions`` is True for a controller without pose
+            deltas.
         OSError: if there is no space for memory maps.
 
     Examples:
