@@ -101,7 +101,7 @@ def test_another_policy():
 def env_for(prior, length=None):
     length = prior.prediction_length if length is None else length
     chunk = ChunkStep(prior.chunk_length, prediction_length=length)
-    anchor = PriorAnchor(make_actor(prior), cold="zero")
+    anchor = PriorAnchor(make_actor(prior))
     return TransformedEnv(CountingEnv(7), Compose(chunk, ActionHistory(H), anchor))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from warmprior import keys
-from warmprior.checks import check_choice, check_keys
+from warmprior.checks import check_keys
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
@@ -68,14 +68,15 @@ class PriorAnchor(EnvTransform):
 
     .. math::
         c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
-        c_\tau = \varepsilon_\tau \text{ or } 0 \;\; (\tau \in C), \qquad a_0 = c + \Delta.
+        c_\tau = \varepsilon_\tau \;\; (\tau \in C), \qquad a_0 = c + \Delta.
 
     The first chunk of an episode and the second half of a preview have no mean. A small box around zero would
     confine these positions to the middle of the source that the policy was trained on; a box around a draw of
     that source does not. This transform draws before the agent acts, so that the agent sees the noise, the
     decision process stays Markov (for WP-Past if whole chunks are executed, see
     :func:`~warmprior.make_prior_space_actor`), and the decoder is deterministic. For a policy with a
-    :class:`~warmprior.StartPoint` the mean is that of the start point.
+    :class:`~warmprior.StartPoint` the mean is that of the start point. For a policy without a moving centre
+    (:func:`~warmprior.has_anchor`) the anchor is zero, which is vanilla DSRL: :math:`a_0 = \Delta`.
 
     Append it after :class:`ActionHistory`, inside or outside batched environments.
 
@@ -86,13 +87,9 @@ class PriorAnchor(EnvTransform):
 
     Args:
         actor: the policy. A learned prior is copied, and the copy moves with the environment.
-        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` writes zero. By default noise if the
-            policy has an anchor (:func:`~warmprior.has_anchor`), and zero otherwise, which is vanilla DSRL:
-            :math:`a_0 = \Delta`.
 
     Raises:
-        ValueError: if ``cold`` is unknown, or the lengths of the environment's history differ from the
-            policy's.
+        ValueError: if the lengths of the environment's history differ from the policy's.
         KeyError: if :class:`ActionHistory` does not precede it.
 
     Examples:
@@ -111,7 +108,7 @@ class PriorAnchor(EnvTransform):
     prior: Any
     start: Any
 
-    def __init__(self, actor: Any, *, cold: Literal["noise", "zero"] | None = None) -> None:
+    def __init__(self, actor: Any) -> None:
         super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
         # Copies, so that moving the environment does not move the policy's own.
         self.prior, self.start = (
@@ -119,23 +116,19 @@ class PriorAnchor(EnvTransform):
             for part in (actor.prior, actor.start)
         )
         self.moves = has_anchor(actor)
-        self.cold = ("noise" if self.moves else "zero") if cold is None else cold
-        check_choice("cold", self.cold, ("noise", "zero"))
         self.observation_key, self.history_key = actor.observation_key, actor.history_key
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(self.history_key, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
-        anchor = torch.zeros_like(forecast)
-        if self.cold == "noise":
-            # Drawn on the CPU, so that a seed gives the same noise on every device.
-            anchor = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
-        if self.moves:
-            with torch.no_grad():
-                mean, valid = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
-            anchor = torch.where(valid, mean, anchor)
-        return next_tensordict.set(keys.ANCHOR, anchor)
+        if not self.moves:
+            return next_tensordict.set(keys.ANCHOR, torch.zeros_like(forecast))
+        # Drawn on the CPU, so that a seed gives the same noise on every device.
+        noise = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
+        with torch.no_grad():
+            mean, valid = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
+        return next_tensordict.set(keys.ANCHOR, torch.where(valid, mean, noise))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return keep_resting(tensordict, self._call(next_tensordict), [keys.ANCHOR])
