@@ -20,6 +20,7 @@ FILES = {"config.json", "model.safetensors"}
 def hub(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with model_hub(monkeypatch, tmp_path / "cache") as server:
+        monkeypatch.setenv("HF_TOKEN", TOKEN)
         yield server
 
 
@@ -44,7 +45,7 @@ def put(hub, actor, folder, **change):
 
 
 def test_a_policy_goes_to_the_hub_and_back(hub, actor):
-    commit = push_policy(actor, NAME, card="# Mine\n", token=TOKEN)
+    commit = push_policy(actor, NAME, card="# Mine\n")
     assert hub.files(NAME)["README.md"] == b"# Mine\n"
     assert set(hub.files(NAME)) == FILES | {"README.md"}
     assert commit == hub.repositories[NAME].branches["main"]
@@ -64,11 +65,11 @@ def test_a_policy_goes_to_the_hub_and_back(hub, actor):
 
 
 def test_revisions(hub, actor):
-    first = push_policy(actor, NAME, token=TOKEN, card="first")
+    first = push_policy(actor, NAME, card="first")
     other = mlp_actor(PastPrior(3), observation_dim=5, nfe=2, seed=1).eval()
-    push_policy(other, NAME, token=TOKEN)
+    push_policy(other, NAME)
     assert hub.files(NAME)["README.md"] == b"first"  # without a card the old one stays
-    push_policy(actor, NAME, token=TOKEN, revision="steady", message="a branch")
+    push_policy(actor, NAME, revision="steady")
     for revision, mine in ((None, other), (first, actor), ("steady", actor)):
         again = load_policy(NAME, revision=revision)
         assert torch.equal(chunk(again), chunk(mine))
@@ -92,7 +93,7 @@ def test_a_folder_is_a_folder(hub, actor, tmp_path):
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
     with raises(ValueError, NAME, "public"):
-        push_policy(actor, NAME, token=TOKEN, private=True)
+        push_policy(actor, NAME, private=True)
     assert not hub.files(NAME) and not hub.objects
 
 

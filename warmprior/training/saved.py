@@ -74,7 +74,7 @@ def _check_format(path: Path, config: Any) -> None:
         )
 
 
-def _folder(place: str | Path, *, revision: str | None = None, token: str | None = None) -> Path:
+def _folder(place: str | Path, revision: str | None) -> Path:
     """Return the folder of a policy, after fetching it from the hub if needed."""
     path = Path(place)
     if path.exists() or not (isinstance(place, str) and is_repository(place)):
@@ -82,7 +82,7 @@ def _folder(place: str | Path, *, revision: str | None = None, token: str | None
             raise ValueError(f"{place} is not a repository on the hub: leave out revision={revision!r}")
         return path
     hub = require("huggingface_hub", "sim")
-    fetch = partial(hub.snapshot_download, place, token=token)
+    fetch = partial(hub.snapshot_download, place)
     # The small file first, because a repository without a policy may be large.
     try:
         folder = Path(fetch(revision=revision, allow_patterns=[CONFIG]))
@@ -147,7 +147,7 @@ def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
 
 def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, Any]:
     """Return the configuration in a saved policy's file; arguments as for :func:`load_policy`."""
-    return _read(_folder(place, revision=revision))[1]
+    return _read(_folder(place, revision))[1]
 
 
 def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -210,10 +210,10 @@ def push_policy(
     card: str | None = None,
     private: bool | None = None,
     revision: str | None = None,
-    message: str = "Upload a policy of warmprior",
-    token: str | None = None,
 ) -> str:
     """Save the policy in a repository on the Hugging Face hub, which is created if needed.
+
+    It needs a token with write access, as ``hf auth login`` keeps it, or in ``HF_TOKEN``.
 
     Args:
         actor: the policy.
@@ -224,8 +224,6 @@ def push_policy(
             an existing one stays.
         private: True for a new private repository; by default the account's setting.
         revision: branch; the main one by default.
-        message: message of the commit.
-        token: token with write access; by default the hub client's own.
 
     Returns:
         The hash of the commit, a ``revision`` for :func:`load_policy`.
@@ -243,7 +241,7 @@ def push_policy(
         '0123456789abcdef0123456789abcdef01234567'
     """
     check_repository(repository)
-    api = require("huggingface_hub", "sim").HfApi(token=token)
+    api = require("huggingface_hub", "sim").HfApi()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         save_policy(actor, folder)
@@ -255,7 +253,10 @@ def push_policy(
         if revision is not None:
             api.create_branch(repository, branch=revision, exist_ok=True)
         sent = api.upload_folder(
-            repo_id=repository, folder_path=folder, commit_message=message, revision=revision
+            repo_id=repository,
+            folder_path=folder,
+            commit_message="Upload a policy of warmprior",
+            revision=revision,
         )
     return str(sent.oid)
 
@@ -264,9 +265,7 @@ def load_policy(
     directory: str | Path,
     *,
     device: torch.device | str = "cpu",
-    generator: torch.Generator | None = None,
     revision: str | None = None,
-    token: str | None = None,
 ) -> WarmPriorActor:
     """Load a policy that :func:`save_policy` or :func:`push_policy` wrote.
 
@@ -275,13 +274,11 @@ def load_policy(
 
     Args:
         directory: the folder with ``model.safetensors``; or, if there is no such folder, a repository on the
-            Hugging Face hub, ``"user/name"``.
+            Hugging Face hub, ``"user/name"``; a private one needs a token, see :func:`push_policy`.
 
     Keyword Args:
         device: device of the weights.
-        generator: source of the sampler's randomness.
         revision: branch, tag or commit of the repository; its main branch by default.
-        token: token for a private repository; by default the hub client's own.
 
     Raises:
         FileNotFoundError: if the folder has no policy.
@@ -299,14 +296,13 @@ def load_policy(
         4
     """
     check_device(device)
-    folder = _folder(directory, revision=revision, token=token)
+    folder = _folder(directory, revision)
     tensors, config = _read(folder)
     try:
         actor = _filled(config, tensors)
     except Exception as error:  # options of another version can raise anything
         reason = str(error) if type(error) is ValueError else repr(error)
         raise ValueError(f"the policy at {folder} cannot be built here: {reason}") from error
-    actor.sampler.generator = generator
     return actor.to(device).eval()
 
 
