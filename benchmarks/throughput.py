@@ -69,8 +69,7 @@ def cloning(
 ) -> BehaviourCloning:
     """Return a training of the network, ready to step, optionally with CUDA graphs."""
     actor, config = WarmPriorActor(network.to(device), PRIOR), TrainingConfig(batch_size=batch)
-    options: dict[str, Any] = {"observation_steps": TO, "compile": graphs}
-    training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, **options)
+    training = BehaviourCloning(actor, steps(400, 200).to(device), config, folder, compile=graphs)
     actor.train()
     return training
 
@@ -210,7 +209,7 @@ def steps_per_second(
 
 
 def preconditioning_over_network(clock: Clock) -> float:
-    network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
+    network = precondition(small_network(), steps(400, 200), PRIOR)
     return clock.ratio(step_of(network), step_of(small_network()), calls=20)
 
 

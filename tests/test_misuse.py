@@ -125,7 +125,6 @@ def test_a_log_that_cannot_be_written_is_named(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(logger, "log_scalar", full)
-    options = {"observation_steps": 1, "logger": logger}
-    training = BehaviourCloning(actor(), steps(), CONFIG, tmp_path / "run", **options)
+    training = BehaviourCloning(actor(), steps(), CONFIG, tmp_path / "run", logger=logger)
     with raises(OSError, "log", "logs"):
         training.run(None)

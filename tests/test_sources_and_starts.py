@@ -56,7 +56,7 @@ def data():
 def cloning(folder, data, start=None, **options):
     actor = WarmPriorActor(network(), GaussianPrior(H), start=start)
     config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
-    return BehaviourCloning(actor, data, config, folder, observation_steps=1, **options)
+    return BehaviourCloning(actor, data, config, folder, **options)
 
 
 def test_agents_search_around_a_source_that_has_no_mean_of_the_history():

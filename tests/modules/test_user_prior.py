@@ -97,7 +97,7 @@ def test_found_by_name_or_place():
 def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     def training(folder, iterations=6):
         config = TrainingConfig(iterations=iterations, batch_size=8, checkpoints=1, save_every=3)
-        return BehaviourCloning(actor_for(Learned(H)), demonstrations(), config, folder, observation_steps=TO)
+        return BehaviourCloning(actor_for(Learned(H)), demonstrations(), config, folder)
 
     whole = training(tmp_path / "whole")
     whole.run(None)

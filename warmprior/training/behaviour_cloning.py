@@ -18,7 +18,7 @@ from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.network import device_of
+from warmprior.modules.network import device_of, uncompiled
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.training.checkpoint import (
     RunState,
@@ -64,7 +64,6 @@ class BehaviourCloning:
         directory: the folder.
 
     Keyword Args:
-        observation_steps: ``To``.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
         compile: True compiles the velocity network with :func:`torch.compile`; on a GPU, with CUDA graphs.
@@ -86,7 +85,7 @@ class BehaviourCloning:
         >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
         >>> data = navigation_demonstrations()
         >>> with TemporaryDirectory() as folder:
-        ...     BehaviourCloning(actor, data, config, folder, observation_steps=1).run()
+        ...     BehaviourCloning(actor, data, config, folder).run()
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['policy_000002', 'state.safetensors']
     """
@@ -98,7 +97,6 @@ class BehaviourCloning:
         config: TrainingConfig,
         directory: str | Path,
         *,
-        observation_steps: int = 2,
         coupling: Coupling | None = None,
         logger: Logger | None = None,
         compile: bool = False,
@@ -120,6 +118,7 @@ class BehaviourCloning:
         prefetch = prefetch or home.type != device.type
         if prefetch:  # a shared generator would be ahead of the losses by the prefetched draws
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
+        observation_steps = uncompiled(actor.network).observation_steps
         see_history = actor.sees_history  # then windows extend the data's observation
         observation_key = OBSERVATION if see_history else actor.observation_key
         self.replay_buffer = window_replay_buffer(

@@ -56,7 +56,6 @@ def new_policy(
             velocity,
             task.data,
             prior,
-            observation_steps=network.observation_steps,
             coupling=coupling,
             withhold=training.cold_probability,
             rest=copy.deepcopy(task.rest),
@@ -204,7 +203,6 @@ def train_policy(
             placed(task.data, device),
             training,
             directory,
-            observation_steps=network.observation_steps,
             coupling=coupling,
             logger=logger,
             compile=compile,
@@ -223,7 +221,6 @@ def precondition(
     data: TensorDictBase,
     prior: Prior,
     *,
-    observation_steps: int = 2,
     coupling: Coupling | None = None,
     withhold: float = 0.0,
     rest: RestingAction | None = None,
@@ -239,7 +236,6 @@ def precondition(
         prior: the source distribution.
 
     Keyword Args:
-        observation_steps: ``To``.
         coupling: pairs sources and targets, as the training does; in order by default.
         withhold: share of the windows whose history is withheld.
         rest: the resting action, for absolute actions; the network then learns the motion from there.
@@ -250,7 +246,7 @@ def precondition(
         >>> from warmprior.envs import navigation_demonstrations
         >>> from warmprior.training import precondition
         >>> network = VelocityMLP(1, 9, 4, observation_steps=1, hidden_dim=8)
-        >>> wrapped = precondition(network, navigation_demonstrations(), PastPrior(4), observation_steps=1)
+        >>> wrapped = precondition(network, navigation_demonstrations(), PastPrior(4))
         >>> type(wrapped).__name__
         'PreconditionedNetwork'
     """
@@ -261,7 +257,7 @@ def precondition(
         data,
         prior,
         batch_size=1024,
-        observation_steps=observation_steps,
+        observation_steps=network.observation_steps,
         withhold=withhold,
         generator=generator,
     )

@@ -161,13 +161,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         features = {keys.ACTION: self.config.action_feature}
         norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
         steps[keys.ACTION] = norm({TransitionKey.ACTION: steps[keys.ACTION]})[TransitionKey.ACTION]
-        return precondition(
-            network,
-            steps,
-            prior,
-            observation_steps=self.config.n_obs_steps,
-            withhold=self.config.cold_probability,
-        )
+        return precondition(network, steps, prior, withhold=self.config.cold_probability)
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and keep moments that were fitted to the training data."""
