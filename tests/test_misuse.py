@@ -20,6 +20,8 @@ from warmprior import (
     policy_transforms,
     window_transforms,
 )
+from warmprior.envs import environment_of
+from warmprior.envs.description import registered_description
 from warmprior.training import BehaviourCloning, NetworkOptions, TrainingConfig, ema_of, train_policy
 
 PRIOR = PastPrior(4)
@@ -116,6 +118,12 @@ def test_an_environment_of_a_guided_policy_with_an_observation_of_another_name()
     base = TransformedEnv(GymEnv("Pendulum-v1"), RenameTransform(["observation"], ["state"]))
     env = TransformedEnv(base, policy_transforms(guided), auto_unwrap=False)
     assert env.rollout(2, guided)["vla_action", "chunk"].shape == (2, 4, 1)
+
+
+def test_an_environment_stacks_the_observations_that_the_network_reads():
+    described = registered_description({"id": "Pendulum-v1", "kwargs": {}}, observation_steps=2)
+    policy = actor(environment=described)
+    assert environment_of(policy, horizon=8).rollout(2, policy)["observation"].shape == (2, 1, 3)
 
 
 def test_a_log_that_cannot_be_written_is_named(tmp_path, monkeypatch):

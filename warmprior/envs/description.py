@@ -113,7 +113,8 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Ca
         # The environments' normaliser stays on the CPU, even if the policy moves to a GPU.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
-        observation_steps=description["observation_steps"],
+        # The network's own: a Task may have been opened for another number.
+        observation_steps=getattr(actor.network, "observation_steps", description["observation_steps"]),
         see_history=actor.sees_history,
         # A guided policy reads the delay's key.
         delay=None if actor.ode.guidance is None else 0,
