@@ -78,7 +78,7 @@ def test_a_forecast_learns_mean_and_spread(kind, data, batch):
 
 def test_a2a_is_a_deterministic_forecast_of_the_last_actions(data, batch):
     prior = learned(A2APrior, data, iterations=800)
-    source = prior.sample(batch["history"])  # no observation
+    source = prior.distribution(batch["history"]).sample()  # no observation
     assert torch.equal(source, prior.distribution(batch["history"]).loc)
     # Linear regression of the level (variance 1/12) on the mean of the last H actions.
     gain = (1 / 12) / (1 / 12 + NOISE**2 / H)

@@ -38,7 +38,7 @@ def test_mip_is_two_supervised_steps(name):
     found = loss(TensorDict(windows, [64]))["loss_flow_matching"]
 
     same = torch.Generator().manual_seed(5)
-    noise = prior.sample(history, observation, same)
+    noise = prior.distribution(history, observation).sample(same)
     second = torch.rand(64, generator=same) < 0.5
     assert 0 < second.sum() < 64
     begun = noise if name == "mip-past" else torch.zeros_like(action)

@@ -121,7 +121,7 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
     found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
-    expected = by_hand(lambda m, g: prior.sample(m["history"], m["observation"], g), data)
+    expected = by_hand(lambda m, g: prior.distribution(m["history"], m["observation"]).sample(g), data)
     assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
 
 

@@ -70,7 +70,7 @@ def test_a_start_point_enters_the_flow_on_the_way():
     assert actor.ode.start_time == actor.replace(nfe=1).ode.start_time == 0.5
     data = batch(prior, 4)
     out = actor(data.clone(), generator=torch.Generator().manual_seed(0))
-    noise = prior.sample(data["history"], generator=torch.Generator().manual_seed(0))
+    noise = prior.distribution(data["history"]).sample(torch.Generator().manual_seed(0))
     a = data["history", "actions"][:, -1:] + 0.5 * noise
     torch.testing.assert_close(out["prior", "noise"], a)
     for t in (0.5, 0.75):

@@ -144,7 +144,7 @@ def test_zero_network_is_optimal_for_gaussian_data(prior, keep, withhold, path):
         moments = SourceMoments.fit(batch, prior, generator=torch.Generator().manual_seed(1))
         network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
     a1 = batch["vla_action", "chunk"]
-    a0 = prior.sample(batch["history"], generator=torch.Generator().manual_seed(2))
+    a0 = prior.distribution(batch["history"]).sample(torch.Generator().manual_seed(2))
     for t in (0.0, 0.3, 0.8, 1.0):
         times = torch.full((len(a1),), t)
         a_t, u = path(a0, a1, times)
@@ -186,7 +186,7 @@ def test_degenerate_ends_stay_finite(prior, path):
     network = PreconditionedNetwork(inner, moments=moments, interpolant=path)
     batch = windows.sample()
     a1 = batch["vla_action", "chunk"]
-    a0 = prior.sample(batch["history"])
+    a0 = prior.distribution(batch["history"]).sample()
     for t in (0.0, 1e-6, 0.5, 1.0):
         times = torch.full((len(a1),), t)
         a_t, _ = path(a0, a1, times)

@@ -13,7 +13,7 @@ def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlatio
     """Variance ``sigma^2``; covariance ``c sigma^2`` between warm positions of one dimension alone."""
     prior = PreviewPrior(3, sigma=0.5, correlation=correlation)
     history = random_history(prior, 1, cold=0.0).expand(40_000)
-    a0 = prior.sample(history, generator=torch.Generator().manual_seed(0))
+    a0 = prior.distribution(history).sample(torch.Generator().manual_seed(0))
     loc = prior.distribution(history).loc
     assert torch.allclose(a0[:, :3].mean(0), loc[0, :3], atol=0.02)
     found = torch.cov(a0.transpose(1, 2).flatten(1).T)  # by dimension, then position

@@ -118,7 +118,7 @@ def test_preconditioning_leaves_the_remainder(prior):
     trend = fit(batch, prior)
     generator = torch.Generator().manual_seed(1)
     moments = SourceMoments.fit(batch, prior, trend=trend, generator=generator)
-    a0 = prior.sample(batch["history"], generator=generator)
+    a0 = prior.distribution(batch["history"]).sample(generator)
     a1, observation = batch["vla_action", "chunk"], batch["observation"]
     resting = RestingPose(COLUMNS)(observation[:, -1]).numpy()
     network = PreconditionedNetwork(Nothing(), moments=moments, trend=trend)

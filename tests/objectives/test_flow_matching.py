@@ -16,6 +16,7 @@ from warmprior import (
     LinearInterpolant,
     PastPrior,
     PreviewPrior,
+    Source,
     window_replay_buffer,
 )
 
@@ -143,7 +144,12 @@ def test_what_a_mask_leaves_out_may_be_nan(entry):
         noise = torch.Generator().manual_seed(0)
         # The same source and times for the windows that count.
         a0 = torch.randn(6, H, batch["vla_action", "chunk"].shape[-1], generator=noise)[-len(batch) :]
-        actor.prior.sample = lambda history, *_, a0=a0: a0 + history["actions"][..., -H:, :].sum() * 0
+
+        def same(history, observation, a0=a0):
+            loc = a0 + history["actions"][..., -H:, :].sum() * 0
+            return Source(loc, torch.zeros(()), torch.ones_like(loc).bool())
+
+        actor.prior.distribution = same
         times = torch.linspace(0, 1, 6)[-len(batch) :]
         loss = FlowMatchingLoss(actor, times=lambda *_, times=times: times)(batch)["loss_flow_matching"]
         loss.backward()

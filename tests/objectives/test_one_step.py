@@ -15,7 +15,7 @@ PRIORS = [GaussianPrior(H), PastPrior(H, sigma=0.4), PreviewPrior(H)]
 def ends(prior, data):
     """The source and target that the loss draws first, and the times after them."""
     generator = torch.Generator().manual_seed(2)
-    a0 = prior.sample(data["history"], generator=generator)
+    a0 = prior.distribution(data["history"]).sample(generator)
     return a0, data["vla_action", "chunk"], torch.rand(len(data), generator=generator)
 
 

@@ -52,7 +52,7 @@ def policy(prior, interpolant=None, network=Still):
 def test_the_unit_is_what_least_squares_leave(prior, path, time):
     network = policy(prior, path).network
     windows, g = batch(seed=5), torch.Generator().manual_seed(6)
-    a0 = prior.sample(windows["history"], generator=g).double()
+    a0 = prior.distribution(windows["history"]).sample(g).double()
     a1 = windows["vla_action", "chunk"].double()
     a_t, velocity = path(a0, a1, torch.full((N,), time).double())
     unit = network.remainder(torch.tensor([time]))[0]

@@ -132,7 +132,8 @@ class SourceMoments(nn.Module):
             raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
         check_positions(keys.CHUNK, batch[keys.CHUNK], prior)
         observation = batch.get(keys.OBSERVATION, None)
-        a0, a1 = prior.sample(batch[keys.HISTORY], observation, generator), batch[keys.CHUNK]
+        source = prior.distribution(batch[keys.HISTORY], observation)
+        a0, a1 = source.sample(generator), batch[keys.CHUNK]
         if coupling is not None:
             sizes = [part.numel() for part in batches]  # it pairs within a batch
             parts = zip(
@@ -144,8 +145,8 @@ class SourceMoments(nn.Module):
             a0, a1 = map(torch.cat, zip(*(coupling(*part) for part in parts), strict=True))
         a0, a1 = a0.double(), a1.double()
         if trend is not None:
-            source, target = trend(batch[keys.OBSERVATION].float())
-            a0, a1 = a0 - source, a1 - target
+            source_trend, target_trend = trend(batch[keys.OBSERVATION].float())
+            a0, a1 = a0 - source_trend, a1 - target_trend
         weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
         count = weight.sum(0)
 

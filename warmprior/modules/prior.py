@@ -148,15 +148,6 @@ class Prior(Registered):
         scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a plain number has no dtype
         return Source(torch.where(warm, loc, 0.0), scale, warm, self.correlation)
 
-    def sample(
-        self,
-        history: TensorDictBase,
-        observation: Tensor | TensorDictBase | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Draw a source sample ``a_0``, ``[*B, P, d_a]``, from :meth:`distribution`."""
-        return self.distribution(history, observation).sample(generator)
-
 
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Check the result of :meth:`Prior.mean`, and return it in the history's dtype."""

@@ -184,7 +184,7 @@ class FlowMatchingLoss(Drawing, LossModule):
             a1 = _blanked(a1, unused)
             if masked:
                 history, observation = (_blanked(part, unused.all(-1)) for part in (history, observation))
-        a0 = actor.prior.sample(history, observation, generator)
+        a0 = actor.prior.distribution(history, observation).sample(generator)
         if self.coupling is not None:
             a0, a1 = self.coupling(a0, a1, observation)
         t = self.times(a1.shape[:-2], generator, a1.dtype, a1.device)
