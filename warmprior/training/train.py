@@ -19,7 +19,6 @@ from warmprior.checks import check_device
 from warmprior.io.distributed import from_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
-from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
@@ -59,7 +58,6 @@ def new_policy(
             coupling=coupling,
             withhold=training.cold_probability,
             rest=copy.deepcopy(task.rest),
-            interpolant=getattr(coupling, "interpolant", None),
         )
     return WarmPriorActor(
         velocity,
@@ -224,7 +222,6 @@ def precondition(
     coupling: Coupling | None = None,
     withhold: float = 0.0,
     rest: RestingAction | None = None,
-    interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
     """Wrap a network in a :class:`~warmprior.PreconditionedNetwork` for a prior and demonstrations.
 
@@ -236,10 +233,10 @@ def precondition(
         prior: the source distribution.
 
     Keyword Args:
-        coupling: pairs sources and targets, as the training does; in order by default.
+        coupling: pairs sources and targets, as the training does; in order by default. The path is its
+            ``interpolant``, if it has one, or linear.
         withhold: share of the windows whose history is withheld.
         rest: the resting action, for absolute actions; the network then learns the motion from there.
-        interpolant: the path of the loss; linear by default.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
@@ -266,4 +263,5 @@ def precondition(
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
         trend = PoseTrend.fit(batch, prior, rest, generator=generator)
     moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
-    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
+    path = getattr(coupling, "interpolant", None)
+    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=path)
