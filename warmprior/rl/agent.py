@@ -144,7 +144,7 @@ class PriorSpaceAgent:
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
         self.config = config
         self.device = next(actor.parameters()).device
-        self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
+        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=config.box(actor))
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
         around_zero: Any = {} if has_anchor(actor) else {"distribution": "clipped"}
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, **around_zero), self.decoder)

@@ -41,11 +41,10 @@ class PriorDecoder(TensorDictModuleBase):
             :class:`~warmprior.lerobot.LeRobotActor`.
         delta: half the width of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
-        nfe: network evaluations per chunk; the actor's own by default.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` only or is
-            guided, or it does not allow ``nfe``.
+        ValueError: if ``delta`` is not a finite number > 0, or the policy is trained at ``t = 0`` only or is
+            guided.
         KeyError: (when called) if an input key is missing.
 
     Examples:
@@ -61,7 +60,7 @@ class PriorDecoder(TensorDictModuleBase):
         (0.5, False)
     """
 
-    def __init__(self, actor: WarmPriorActor, *, delta: float, nfe: int | None = None) -> None:
+    def __init__(self, actor: WarmPriorActor, *, delta: float) -> None:
         super().__init__()
         check_positive(delta=delta)
         check_usual_keys(actor, "PriorDecoder")
@@ -75,8 +74,6 @@ class PriorDecoder(TensorDictModuleBase):
             )
         self.delta = float(delta)
         self.ode = copy.deepcopy(actor.ode)
-        actor.sampling.evaluations(nfe)
-        self.nfe = nfe  # the policy's own by default
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         self.requires_grad_(False).eval()
@@ -104,7 +101,7 @@ class PriorDecoder(TensorDictModuleBase):
         check_shape(str(keys.DELTA), delta, anchor.shape)
         noise = anchor + delta.to(anchor.dtype)  # the chunk is in the environment's precision
         inputs = tensordict.select(self.observation_key).set(self.out_keys[0], noise)
-        return tensordict.update(self.ode(inputs, nfe=self.nfe).select(*self.out_keys))
+        return tensordict.update(self.ode(inputs).select(*self.out_keys))
 
     def check_env(self, env: EnvBase) -> None:
         """Check that the policy's chunks have the length and width that an environment takes.
