@@ -121,7 +121,7 @@ def test_an_environment_of_a_guided_policy_with_an_observation_of_another_name()
 
 
 def test_an_environment_stacks_the_observations_that_the_network_reads():
-    described = registered_description({"id": "Pendulum-v1", "kwargs": {}}, observation_steps=2)
+    described = registered_description({"id": "Pendulum-v1", "kwargs": {}})
     policy = actor(environment=described)
     assert environment_of(policy, horizon=8).rollout(2, policy)["observation"].shape == (2, 1, 3)
 

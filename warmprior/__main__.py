@@ -254,8 +254,8 @@ def train(
     check_device(device)  # before the demonstrations are read
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
     sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
-    chosen, steps = asdict(data), network.observation_steps
-    whole = Task.open(place, observation_steps=steps, demos=chosen.pop("demonstrations"), **chosen)
+    chosen = asdict(data)
+    whole = Task.open(place, demos=chosen.pop("demonstrations"), **chosen)
     recorded: Any = whole.environment
     playable = recorded is not None
     if is_registered(recorded) and recorded["gymnasium"]["success"] is None:
@@ -290,20 +290,19 @@ def train(
             f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
             f"the mean action has {spread:.4f}:"
         )
-        for n, error in errors_of(actor, left_out, steps, (*nfes, sampling.evaluations())).items():
+        for n, error in errors_of(actor, left_out, (*nfes, sampling.evaluations())).items():
             print(f"  NFE {n}: {error:.4f}")
     if playable:
         print(f"to play it: python -m warmprior evaluate {saved} --nfe {' '.join(map(str, nfes[::-1]))}")
     print(saved)
 
 
-def errors_of(
-    actor: WarmPriorActor, data: TensorDictBase, observation_steps: int, nfes: Sequence[int]
-) -> dict[int, float]:
+def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:
     """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
     from warmprior.diagnostics import action_error, encoded_windows
 
-    windows = window_transforms(data, actor.prior, observation_steps=observation_steps)
+    network: Any = actor.network
+    windows = window_transforms(data, actor.prior, observation_steps=network.observation_steps)
     frames = torch.linspace(0, len(data) - 1, min(len(data), 4096)).round().long()
     batch = encoded_windows(actor, windows(TensorDict({FRAME: frames}, [len(frames)])))
     return action_error(actor, batch, nfes=nfes)

@@ -85,7 +85,7 @@ class Policy:
 
     def task(self) -> Task:
         """Return its task, which is read once per process."""
-        return cached_task(self.data, *self.place, self.network.observation_steps)
+        return cached_task(self.data, *self.place)
 
     def teacher(self) -> Policy | None:
         method = self.method.teacher
@@ -132,8 +132,7 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
     run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find the files of the first
         places = [*([] if only else task_places(options.data)), *more]
-        steps = options.network.observation_steps
-        tasks = {place: cached_task(options.data, *place, steps) for place in places}
+        tasks = {place: cached_task(options.data, *place) for place in places}
         names = [(task.name, task.style) for task in tasks.values()]
         if twice := [" ".join(name) for name in set(names) if names.count(name) > 1]:
             raise ValueError(
@@ -349,16 +348,15 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
 @lru_cache(maxsize=1)
 def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
     """Return a policy and its environment, kept for the next episodes of the same policy."""
-    key = (policy.data, *policy.place, policy.network.observation_steps)
     actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance, temperature=cell.temperature)
-    base = simulator(key, play_on)
+    base = simulator((policy.data, *policy.place), play_on)
     return actor, policy.task().env(actor, base, execute=cell.execute, delay=cell.delay)
 
 
 @lru_cache(maxsize=1)
-def simulator(task: tuple[Any, ...], play_on: bool) -> EnvBase:
+def simulator(place: tuple[Any, ...], play_on: bool) -> EnvBase:
     """Return the environment of a task, kept for all policies, because building it takes a second."""
-    return cached_task(*task).make_env(**({"terminate_on_success": False} if play_on else {}))
+    return cached_task(*place).make_env(**({"terminate_on_success": False} if play_on else {}))
 
 
 def row(

@@ -235,9 +235,7 @@ def check_network(network: NetworkOptions, data: DataOptions) -> None:
         require("torchvision", "vision")
 
 
-def robosuite_task(
-    path: Path | str, style: str, *, source: str, observation_steps: int, options: DataOptions
-) -> Task:
+def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOptions) -> Task:
     """Return the task of a file of demonstrations; ``source`` is scripted, official or file."""
     # Only a file of the user's may have too many demonstrations, or be of an unknown task.
     demos = None if source == "scripted" else options.first(style)
@@ -256,7 +254,6 @@ def robosuite_task(
         place,
         task=named,
         style=style,
-        observation_steps=observation_steps,
         actions=options.actions,
         mask=options.mask,
         demos=demos,
@@ -352,7 +349,7 @@ def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
     return Task("navigation", style, navigation_demonstrations(octaves), make_env)
 
 
-def load_task(options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2) -> Task:
+def load_task(options: DataOptions, name: str | None, style: str = "ph") -> Task:
     """Read, download or generate the demonstrations of one task.
 
     Args:
@@ -360,7 +357,6 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         name: a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
             which may take the options; ``None`` for the task of ``options.dataset``.
         style: style of the demonstrations.
-        observation_steps: ``To`` of the policies.
 
     Raises:
         ValueError: if there is no such task, or a file is of another one.
@@ -383,7 +379,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
             raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
         return task
     path, source = demonstrations_of(options, name, style)
-    return robosuite_task(path, style, source=source, observation_steps=observation_steps, options=options)
+    return robosuite_task(path, style, source=source, options=options)
 
 
 def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:

@@ -19,7 +19,7 @@ Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
 
 def actor(tmp_path, actions="absolute", horizon=None):
-    environment = environment_description(task_env_args("lift"), "ph", 2, actions, horizon=horizon)
+    environment = environment_description(task_env_args("lift"), "ph", actions, horizon=horizon)
     network = VelocityMLP(10 if actions == "absolute" else 7, 19, 4, hidden_dim=16)
     policy = WarmPriorActor(network, PastPrior(4), nfe=1, environment=environment)
     save_policy(policy, tmp_path)
@@ -71,7 +71,7 @@ def solved(path, actions):
     import h5py
 
     data = RobomimicDemonstrations(path, absolute_actions=actions == "absolute")
-    make_env, adapters = robosuite_parts(environment_description(data.env_args, "ph", 2, actions))
+    make_env, adapters = robosuite_parts(environment_description(data.env_args, "ph", actions))
     env = TransformedEnv(make_env(), Compose(*adapters.values()))
     outcomes = []
     with h5py.File(path) as file:
@@ -95,10 +95,10 @@ def test_demonstrations_replay_in_both_spaces(lift_demonstrations):
 
 @pytest.mark.parametrize(
     "change",
-    [{"actions": "joint"}, {"observation_steps": None}, {"images": {"size": 84}}, {"robosuite": {"seed": 7}}],
+    [{"actions": "joint"}, {"robosuite": None}, {"images": {"size": 84}}, {"robosuite": {"seed": 7}}],
 )
 def test_a_description_with_more_or_less_builds_nothing(change):
-    described = environment_description(task_env_args("lift"), "ph", 2)
+    described = environment_description(task_env_args("lift"), "ph")
     for name, value in change.items():
         described[name] = {**described.get(name, {}), **value} if isinstance(value, dict) else value
         if value is None:

@@ -261,7 +261,7 @@ def saved_policy(folder, **options):
     seen = options.get("observation_key") == keys.CONDITIONED
     width = HistoryObservation.width(8, 7) if seen else 0
     network = stirred(VelocityMLP(7, OBJECT + STATE + width, 8), by=0.05)
-    environment = environment_description(task_env_args("lift"), "ph", 2, "delta", None)
+    environment = environment_description(task_env_args("lift"), "ph")
     chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
     actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
     save_policy(actor, folder)

@@ -19,7 +19,7 @@ from warmprior.envs.simulator import task_env_args
 
 def test_frames_are_of_the_evaluated_episode(monkeypatch):
     torch.manual_seed(0)
-    environment = environment_description(task_env_args("lift"), "ph", 2)
+    environment = environment_description(task_env_args("lift"), "ph")
     network = VelocityMLP(7, 19, 4, hidden_dim=16)
     actor = WarmPriorActor(network, PastPrior(4), clip=1.0, environment=environment)
     states = []
@@ -65,7 +65,7 @@ def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypa
     gymnasium.register("DrawnDial-v0", DrawnDial, max_episode_steps=4)
     monkeypatch.setitem(gymnasium.registry, "DrawnDial-v0", gymnasium.registry.pop("DrawnDial-v0"))
     recorded = {"id": "DrawnDial-v0", "kwargs": {"render_mode": "human"}, "max_episode_steps": 4}
-    described = registered_description({**recorded, "success": "solved", "observation_keys": []}, 1)
+    described = registered_description({**recorded, "success": "solved", "observation_keys": []})
     network = VelocityMLP(1, 2, 2, observation_steps=1, hidden_dim=16)
     actor = WarmPriorActor(network, GaussianPrior(2), clip=1.0, environment=described)
     video = tmp_path / "video.mp4"

@@ -15,6 +15,7 @@ from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.gymnasium import registered_env
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import uncompiled
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import policy_transforms
@@ -25,7 +26,6 @@ _IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
 def environment_description(
     env_args: Mapping[str, Any],
     style: str,
-    observation_steps: int,
     actions: Literal["delta", "absolute"] = "delta",
     images: Mapping[str, Any] | None = None,
     *,
@@ -39,7 +39,6 @@ def environment_description(
     Args:
         env_args: see :class:`RobosuiteEnv`.
         style: see :class:`RobosuiteEnv`.
-        observation_steps: ``To``.
         actions: the policy's actions: the environment's own pose deltas, or absolute poses (see
             :class:`~warmprior.transforms.AbsoluteActions`).
         images: options of a policy's images, if it sees any: ``"cameras"`` and ``"size"``, see
@@ -52,16 +51,12 @@ def environment_description(
 
     Examples:
         >>> from warmprior.envs import environment_description
-        >>> environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
-        {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
-         'observation_steps': 2}
+        >>> environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph")
+        {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'}}
     """
     chosen = None if low_dim_keys is None else list(low_dim_keys)
     options = given(low_dim_keys=chosen, horizon=horizon)
-    description: dict[str, Any] = {
-        "robosuite": {"env_args": dict(env_args), "style": style, **options},
-        "observation_steps": observation_steps,
-    }
+    description: dict[str, Any] = {"robosuite": {"env_args": dict(env_args), "style": style, **options}}
     if actions != "delta":
         description["actions"] = actions
     if images is not None:
@@ -113,8 +108,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Ca
         # The environments' normaliser stays on the CPU, even if the policy moves to a GPU.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
-        # The network's own: a Task may have been opened for another number.
-        observation_steps=getattr(actor.network, "observation_steps", description["observation_steps"]),
+        observation_steps=getattr(uncompiled(actor.network), "observation_steps", None),
         see_history=actor.sees_history,
         # A guided policy reads the delay's key.
         delay=None if actor.ode.guidance is None else 0,
@@ -156,19 +150,15 @@ def environment_name(actor: WarmPriorActor) -> str | None:
 _REGISTERED = {"id", "kwargs", "max_episode_steps", "success", "observation_keys"}
 
 
-def registered_description(environment: Mapping[str, Any], observation_steps: int) -> dict[str, Any]:
+def registered_description(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the description of an environment that :func:`registered_env` builds."""
-    return {
-        "gymnasium": {name: environment.get(name) for name in sorted(_REGISTERED)},
-        "observation_steps": observation_steps,
-    }
+    return {"gymnasium": {name: environment.get(name) for name in sorted(_REGISTERED)}}
 
 
 def is_registered(description: Any) -> bool:
     """Return True if a description has the form of :func:`registered_description`."""
     try:
-        complete = description.keys() == {"gymnasium", "observation_steps"}
-        return complete and description["gymnasium"].keys() == _REGISTERED
+        return description.keys() == {"gymnasium"} and description["gymnasium"].keys() == _REGISTERED
     except AttributeError:
         return False
 
@@ -178,7 +168,7 @@ def _is_complete(description: Any) -> bool:
     try:
         images = description.get("images", dict.fromkeys(_IMAGES))
         return (
-            description.keys() - {"actions", "images"} == {"robosuite", "observation_steps"}
+            description.keys() - {"actions", "images"} == {"robosuite"}
             and description["robosuite"].keys() - {"low_dim_keys", "horizon"} == {"env_args", "style"}
             and description.get("actions", "delta") in ("delta", "absolute")
             and images.keys() == set(_IMAGES)

@@ -118,14 +118,13 @@ class BehaviourCloning:
         prefetch = prefetch or home.type != device.type
         if prefetch:  # a shared generator would be ahead of the losses by the prefetched draws
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
-        observation_steps = uncompiled(actor.network).observation_steps
         see_history = actor.sees_history  # then windows extend the data's observation
         observation_key = OBSERVATION if see_history else actor.observation_key
         self.replay_buffer = window_replay_buffer(
             data,
             actor.prior,
             batch_size=config.batch_size // world_size(),
-            observation_steps=observation_steps,
+            observation_steps=uncompiled(actor.network).observation_steps,
             see_history=see_history,
             withhold=config.cold_probability,
             generator=windows,
@@ -144,7 +143,6 @@ class BehaviourCloning:
             "coupling": part_identity(coupling),
             "network": part_identity(actor.network),
             "policy": {
-                "observation_steps": observation_steps,
                 "clip": actor.sampling.clip,
                 "max_nfe": actor.sampling.max_nfe,
                 "normalizer": fixed_identity(actor.normalizer),  # data in other units may be equal

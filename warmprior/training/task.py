@@ -165,7 +165,6 @@ class Task:
         *,
         task: str | None = None,
         style: str | None = None,
-        observation_steps: int = 2,
         actions: Literal["delta", "absolute"] = "delta",
         observation_keys: Sequence[str] | None = None,
         joint_key: str | None = None,
@@ -189,7 +188,6 @@ class Task:
             task: task of robosuite, for a LeRobotDataset that does not describe its environment.
             style: style of the demonstrations, which decides robosuite's time limit: ``"ph"`` by default,
                 and ``"human"`` outside robosuite.
-            observation_steps: ``To`` of the policies.
             actions: the policies' actions: pose deltas as recorded, or the absolute poses that these target.
             observation_keys: observations to concatenate; by default the task's, or all of a Minari dataset.
             joint_key: the observation whose numbers the actions set, one by one, such as joint positions;
@@ -256,7 +254,7 @@ class Task:
             environment |= {"observation_keys": list(index.observation_keys)}
             if horizon is not None:
                 environment["max_episode_steps"] = horizon
-            description = registered_description(environment, observation_steps)
+            description = registered_description(environment)
             # Unknown wrappers raise an error only when it is built, which training does not need.
             recorded: Any = partial(registered_env, environment)
             return replace(opened, facts=facts, make_env=recorded, environment=description)
@@ -280,7 +278,6 @@ class Task:
             dataset,
             images,
             style=style,
-            observation_steps=observation_steps,
             actions=actions,
             horizon=horizon,
         )

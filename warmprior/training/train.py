@@ -155,7 +155,6 @@ def train_policy(
     if isinstance(demonstrations, str | Path):
         task = Task.open(
             demonstrations,
-            observation_steps=network.observation_steps,
             observation_keys=observation_keys,
             image_keys=image_keys,
         )
