@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from tests.errors import raises
 from tests.lerobot.seen import watch
@@ -114,6 +114,9 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
             actor(data.clone())
         acted = torch.cat([x[:, 0] for x in seen.x[:: len(seen.x) // 2]])
     assert torch.cdist(acted, acted).add(torch.eye(4)).min() > 1e-3  # two decisions of two rows
+    with watch("multi_task_dit", made) as seen, set_exploration_type(ExplorationType.DETERMINISTIC):
+        chunks = [actor(data.clone())["vla_action", "chunk"] for _ in range(2)]
+    assert torch.equal(*chunks) and not seen.x[0][:, 0].any()
     data["prior", "noise"] = loc.contiguous()
     with watch("multi_task_dit", made) as seen:
         chunks = [actor.ode(data.clone())["vla_action", "chunk"] for _ in range(2)]

@@ -227,11 +227,10 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         """Draw the source and the chunk."""
         chunks, generator = self.ode.source, self.chosen_generator(generator)
         source = chunks.distribution(tensordict.get(keys.HISTORY, None))
-        loc, a0 = (
-            chunks.scaled(v, source.warm)
-            for v in (source.loc, source.sample(generator, noise_factor(self.sampling.temperature)))
-        )
+        temperature = noise_factor(self.sampling.temperature)
+        values = source.loc, source.sample(generator, temperature)
+        loc, a0 = (chunks.scaled(value, source.warm) for value in values)
         for key, value in zip(self.out_keys, (loc, source.warm, a0), strict=False):
             tensordict.set(key, value)
-        padding = chunks.place(a0.reshape(-1, *a0.shape[-2:]), generator)
+        padding = temperature * chunks.place(a0.reshape(-1, *a0.shape[-2:]), generator)
         return self.ode(tensordict, nfe=nfe, padding=padding)
