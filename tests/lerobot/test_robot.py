@@ -63,6 +63,10 @@ def test_an_adapter_brings_policy_and_prior(policy):
     assert actor.prior is prior and actor.sampling.nfe == 2 and actor.ode.policy is made
     with raises(ValueError, "prior"):
         LeRobotActor(made)
+    few = LeRobotActor(policy("smolvla", n_action_steps=2), prior, preprocess=preprocessed)
+    for delay, execute in {0: 2, 1: 2, 4: 4}.items():  # as LeRobot's own loop does, if decisions are as fast
+        with AsyncExecutor(few, delay=delay) as executor:
+            assert executor.execute == execute
     guided = WarmPriorAdapter(policy("smolvla", n_action_steps=2), prior, guidance=RealTimeChunking())
     with raises(ValueError, "guidance"):
         LeRobotActor(guided)

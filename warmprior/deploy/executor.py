@@ -64,7 +64,8 @@ class AsyncExecutor:
             ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``. It is set to evaluation
             mode, and called without batch dimensions.
         prior: the policy's prior (only its lengths are used); the actor's own by default.
-        execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
+        execute: control steps between decisions; by default ``H`` (of a LeRobot policy its
+            ``n_action_steps``), or as many as ``delay`` allows.
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.
         control_rate: control steps per second.
@@ -130,7 +131,8 @@ class AsyncExecutor:
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
         if execute is None:
-            execute = min(prior.chunk_length, length - expected)
+            own = max(getattr(plain, "execute", length), expected)
+            execute = min(own, prior.chunk_length, length - expected)
         check_delay(expected, execute, length)
         check_between(1, prior.chunk_length, execute=execute)
         if normalizer is not None and keys.ACTION not in normalizer.keys:

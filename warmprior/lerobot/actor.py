@@ -217,6 +217,11 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         return {name: tuple(features[entry].shape) for name, entry in names.items()}
 
     @property
+    def execute(self) -> int:
+        """The number of actions per chunk that LeRobot's own loop executes."""
+        return int(self.ode.policy.config.n_action_steps)
+
+    @property
     def device(self) -> torch.device:
         """The device of LeRobot's policy."""
         return next(self.ode.policy.parameters()).device
