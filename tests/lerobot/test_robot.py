@@ -43,10 +43,7 @@ def test_a_warm_policy_acts_as_its_own_loop_does(found, name):
         }
         expected.append(10 * policy.select_action(preprocessed(batch))[0])
 
-    def preprocess(batch):
-        return preprocessed({key: value.float() for key, value in batch.items()})
-
-    actor = LeRobotActor(policy, preprocess=preprocess, postprocess=lambda action: 10 * action)
+    actor = LeRobotActor(policy, preprocess=preprocessed, postprocess=lambda action: 10 * action)
     with AsyncExecutor(actor, latency=0) as executor:
         torch.manual_seed(1)
         found_actions = torch.stack([executor.act(observation) for observation in seen])

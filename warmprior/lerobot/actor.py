@@ -116,7 +116,8 @@ class LeRobotFlow(TensorDictModuleBase):
                     f"{name} has {count} of {steps} observations: append ObservationStack({steps})"
                 )
             value = value[:, -1] if steps == 1 else value[:, -steps:]
-            inputs[name] = value / 255.0 if value.dtype == torch.uint8 else value
+            # In the precision that LeRobot's own loops give: robots and simulators also have float64.
+            inputs[name] = value / 255.0 if value.dtype == torch.uint8 else value.float()
         return inputs if self.preprocess is None else self.preprocess(inputs)
 
 
