@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.lerobot.plugin_policies import saved_flow_policy, warm
+from tests.lerobot.plugin_policies import saved_flow_policy, small, warm
 from tests.lerobot.test_actor import preprocessed
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
+from tests.toy_env import stirred
 from warmprior import PastPrior, RealTimeChunking
 from warmprior.deploy import AsyncExecutor
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
@@ -91,24 +92,39 @@ def test_a_warm_flow_policy_acts_by_its_averaged_weights(found, tmp_path, camera
     assert torch.stack(expected)[:, 0].std() > 0.01
 
 
-def test_a_saved_vla_is_loaded_with_its_processors(found, tmp_path, monkeypatch):
+@pytest.mark.parametrize("adapted", [False, True])
+def test_a_saved_vla_is_loaded_with_its_processors(found, tmp_path, monkeypatch, adapted):
+    """Also one that was fine-tuned with ``--peft``, of which LeRobot saves the adapters."""
     from lerobot_policy_warmprior import robot
 
     policy = warm(found, "warm_smolvla", prior="past", n_action_steps=LENGTH).eval()
-    policy.save_pretrained(tmp_path)
+    config, place, base = policy.config, str(tmp_path / "run"), str(tmp_path / "base")
+    policy.save_pretrained(base if adapted else place)
+    if adapted:
+        pytest.importorskip("peft")
+        config.pretrained_path, config.load_vlm_weights = base, True
+        tuned = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 2})
+        config.load_vlm_weights = False
+        stirred(torch.nn.ParameterList(w for w in tuned.parameters() if w.requires_grad))
+        tuned.save_pretrained(place), config.save_pretrained(place)
     tasks = []
 
     def before(batch):
         tasks.append(batch.pop("task"))
-        return preprocessed({key: value.float() for key, value in batch.items()})
+        return preprocessed(batch)
 
     # The tokeniser of LeRobot's is on the hub, and so is the backbone's configuration.
     pipelines = before, lambda action: action + 100
     monkeypatch.setattr(robot, "make_pre_post_processors", lambda *args, **options: pipelines)
-    monkeypatch.setattr(type(policy), "from_pretrained", classmethod(lambda kind, *args, **options: policy))
-    with AsyncExecutor(robot.load_actor(tmp_path, task="wave"), latency=0) as executor:
-        action = executor.act(next(iter(observations(1, 64))))
-    assert tasks == [["wave"]] and action.shape == (ACTION,) and action.min() > 50
+    with small("warm_smolvla"):
+        actors = [robot.load_actor(place, task="wave"), LeRobotActor(policy, preprocess=preprocessed)]
+    actions = []
+    for actor in actors:
+        torch.manual_seed(0)
+        with AsyncExecutor(actor, latency=0) as executor:
+            actions.append(executor.act(next(iter(observations(1, 64)))))
+    assert tasks == [["wave"]] and actions[0].shape == (ACTION,)
+    torch.testing.assert_close(actions[0], actions[1] + 100)
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> War
     """
     config = PreTrainedConfig.from_pretrained(str(place))
     config.device = device
-    policy = get_policy_class(config.type).from_pretrained(str(place), config=config).to(device).eval()
+    policy = _policy(str(place), config).to(device).eval()
     before, after = make_pre_post_processors(
         config, pretrained_path=str(place), preprocessor_overrides={"device_processor": {"device": device}}
     )
@@ -50,6 +50,18 @@ def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> War
         return before({**batch, "task": [task] * len(next(iter(batch.values())))})
 
     return LeRobotActor(policy, preprocess=preprocess, postprocess=after)
+
+
+def _policy(place: str, config: Any) -> Any:
+    """Return a saved policy; of a fine-tuning with ``--peft``, the base policy with its adapters."""
+    kind = get_policy_class(config.type)
+    if not config.use_peft:
+        return kind.from_pretrained(place, config=config)
+    from peft import PeftConfig, PeftModel
+
+    base = PeftConfig.from_pretrained(place)
+    policy: Any = kind.from_pretrained(base.base_model_name_or_path, config=config, revision=base.revision)
+    return PeftModel.from_pretrained(policy, place, config=base).get_base_model()
 
 
 def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
