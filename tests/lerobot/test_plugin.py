@@ -20,6 +20,8 @@ def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
     taken = {f.name: getattr(base.config, f.name) for f in dataclasses.fields(base.config) if f.init}
     config = found[name].config_class(**taken, prior="past,sigma=0.0")
     assert config.action_delta_indices == list(range(-LENGTH, LENGTH))
+    dropped = [getattr(of, "drop_n_last_frames", 0) for of in (config, base.config)]
+    assert dropped[0] == dropped[1]  # the same steps of an episode begin a window
     with small(name):
         policy = found[name].from_pretrained(tmp_path / "base", config=config)
     for key, value in base.state_dict().items():
