@@ -101,6 +101,8 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
             assert torch.equal(batch[name], theirs[name]), name
         observation = {"observation.state": raw["observation.state"], "task": raw["task"]}
         assert "action_history" not in pipeline(observation)
+        pipeline.steps[2].valid_action_horizon = 2  # of an embodiment; it does not limit what is remembered
+        torch.testing.assert_close(pipeline(dict(raw))["action_history"], scaled)
     # A training that continues takes the saved processors, which have to remember as many actions.
     check_pretrained(config, str(tmp_path))
     asked = {}

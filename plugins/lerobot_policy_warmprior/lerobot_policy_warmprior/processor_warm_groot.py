@@ -42,8 +42,10 @@ class WarmGrootPackInputsStep(GrootN17PackInputsStep):
         if window is None:
             return super().__call__(transition)
         length, width = self.history_length, window.shape[-1]
-        past = super().__call__({TransitionKey.ACTION: window[:, :length]})[TransitionKey.ACTION]
-        more: dict[str, Any] = {HISTORY: past[:, :length, :width]}
+        # Step by step, because GR00T blanks a chunk's steps past the embodiment's horizon.
+        steps = {TransitionKey.ACTION: window[:, :length].flatten(0, 1)}
+        past = super().__call__(steps)[TransitionKey.ACTION][:, 0, :width]
+        more: dict[str, Any] = {HISTORY: past.unflatten(0, (-1, length))}
         if PAD in data:
             more[HISTORY_IS_PAD], data[PAD] = data[PAD][:, :length], data[PAD][:, length:]
         transition[TransitionKey.ACTION] = window[:, length:]
