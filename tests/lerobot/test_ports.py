@@ -5,7 +5,7 @@ import torch
 
 from tests.errors import raises
 from tests.lerobot.seen import at_times, watch
-from tests.lerobot.tiny import ACTION, LENGTH, MAKERS, STEPS, observations, width, windows
+from tests.lerobot.tiny import ACTION, LENGTH, MAKERS, N15, STEPS, observations, width, windows
 from warmprior import GaussianPrior, PastPrior
 from warmprior.lerobot import WarmPriorAdapter
 from warmprior.lerobot.ports import port_for
@@ -113,7 +113,11 @@ def test_the_chunk_is_integrated_from_this_source(family, policy):
     for x, by_hand in zip(seen.x, path, strict=False):
         torch.testing.assert_close(x, by_hand, rtol=1e-4, atol=1e-5)
     if family != "multi_task_dit":
-        torch.testing.assert_close(chunk, path[-1][..., :ACTION], rtol=1e-4, atol=1e-5)
+        end = path[-1][..., :ACTION]
+        if family == "groot" and not N15:  # its postprocessors clamp what is executed
+            assert end.abs().max() > 1
+            end = end.clamp(-1, 1)
+        torch.testing.assert_close(chunk, end, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

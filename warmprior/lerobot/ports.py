@@ -136,6 +136,9 @@ class FlowPort:
     sampler: str
     steps: str
 
+    bounded = False
+    """True if the family's postprocessors clamp actions to [-1, 1]."""
+
     def length(self, policy: Any) -> int:
         """Return ``T``, the length of the noisy chunk."""
         return int(attrgetter(self.chunk_length)(policy))
@@ -165,7 +168,9 @@ class FlowPort:
 
         def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             output = self.sample(policy, source, sample, *args, **kwargs)
-            record(output if isinstance(output, Tensor) else output["action_pred"])
+            chunk = output if isinstance(output, Tensor) else output["action_pred"]
+            # Within the output, so that the remembered actions are those that are executed.
+            record(chunk.clamp_(-1.0, 1.0) if self.bounded else chunk)
             return output
 
         with (
@@ -242,6 +247,8 @@ class OpenPiPort(FlowPort):
 
 class GrootPort(FlowPort):
     """The port of GR00T N1.7."""
+
+    bounded = True
 
     def check(self, policy: Any) -> None:
         """Raise ValueError for relative actions, which cannot be expressed at the next state from outside."""
