@@ -199,6 +199,8 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
             raise ValueError(f"{type(policy).__name__} has no prior of its own: give LeRobotActor one")
         self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
         self.postprocess = postprocess
+        #: The number of actions per chunk that LeRobot's own loop executes.
+        self.execute = int(policy.config.n_action_steps)
         self.network, self.sampling = self.ode.network, self.ode.sampling
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *history_keys()]
@@ -216,11 +218,6 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         if not set(names.values()) <= set(features):
             return None
         return {name: tuple(features[entry].shape) for name, entry in names.items()}
-
-    @property
-    def execute(self) -> int:
-        """The number of actions per chunk that LeRobot's own loop executes."""
-        return int(self.ode.policy.config.n_action_steps)
 
     @property
     def device(self) -> torch.device:

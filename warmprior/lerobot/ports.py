@@ -166,8 +166,8 @@ class FlowPort:
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
         """Let new chunks start from the source, and call ``record`` with each, including its padding."""
 
-        def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            output = self.sample(policy, source, sample, *args, **kwargs)
+        def sampled(call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            output = self.sample(policy, source, call, *args, **kwargs)
             chunk = output if isinstance(output, Tensor) else output["action_pred"]
             # Within the output, so that the remembered actions are those that are executed.
             record(chunk.clamp_(-1.0, 1.0) if self.bounded else chunk)
@@ -179,12 +179,10 @@ class FlowPort:
         ):
             yield
 
-    def sample(
-        self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
-    ) -> Any:
+    def sample(self, policy: Any, source: Source, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call the policy's sampler with noise from the source."""
         with SourceInjection(self.length(policy), self.width(policy), source):
-            return sample(*args, **kwargs)
+            return call(*args, **kwargs)
 
     def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
         """Return a context in which ``guide`` changes the sampler's velocities, with the source at time 0."""
@@ -219,14 +217,12 @@ class OpenPiPort(FlowPort):
             yield
         _check_once(f"{type(policy).__name__} evaluated its model", len(calls))
 
-    def sample(
-        self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
-    ) -> Any:
+    def sample(self, policy: Any, source: Source, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Pass the source to the sampler as an argument."""
         check_no_noise(kwargs)
         image = args[0][0]
         shape = torch.Size((len(image), self.length(policy), self.width(policy)))
-        return sample(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
+        return call(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
 
     def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
         """Guide velocities with reversed sign: these families integrate from 1, the source, to 0."""
