@@ -109,7 +109,7 @@ def _copied(name: str, value: Any) -> Tensor:
         # Copied by NumPy, since PyTorch takes no array with negative strides, as from BGR to RGB.
         return torch.from_numpy(np.array(value, order="C"))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name!r} is not an array of numbers, but {type(value).__name__}") from error
+        raise ValueError(f"{name!r} is not an array of numbers: {error}") from error
 
 
 def _fitted(name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
