@@ -137,3 +137,15 @@ def test_own_priors_come_by_lerobots_own_option(found, place, tmp_path, monkeypa
     main.__annotations__["cfg"] = config
     parser.wrap()(main)()
     assert seen[0].name == name and seen[0].sigma == 0.1
+
+
+def test_groots_horizon_is_that_of_the_training_where_its_checkpoint_is_not(found, tmp_path):
+    base, arm = tmp_path / "base", {"action": {"delta_indices": [0, 1, 2]}}
+    base.mkdir()
+    processor = {"processor_kwargs": {"modality_configs": {"arm": arm}}}
+    (base / "processor_config.json").write_text(json.dumps(processor))
+    options = {"base_model_path": str(base), "embodiment_tag": "arm", "n_action_steps": 3}
+    warm(found, "warm_groot", **options).save_pretrained(tmp_path / "warm")
+    base.rename(tmp_path / "elsewhere")
+    again = load(found, "warm_groot", tmp_path / "warm")
+    assert again.warm_adapter.prior.chunk_length == 3

@@ -18,6 +18,11 @@ class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     config_class = WarmGrootConfig
     name = "warm_groot"
 
+    def __init__(self, config: Any, **kwargs: Any) -> None:
+        # Saved, because the default depends on files below base_model_path that a robot may not have.
+        config.prior_chunk = config.make_prior().chunk_length
+        super().__init__(config, **kwargs)
+
     @classmethod
     def from_pretrained(
         cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
