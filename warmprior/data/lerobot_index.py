@@ -444,6 +444,6 @@ def _image_size(
         shape = tuple(features[cameras[key]]["shape"])
         side = max(shape)
         if shape not in ((side, side, 3), (3, side, side)):
-            raise DatasetError(f"{root}: {cameras[key]!r} has shape {shape}; only square images can be used")
+            raise DatasetError(f"{root}: {cameras[key]!r} has shape {shape}: resize images to be square")
         sizes[side] = cameras[key]
     return common_size(root, sizes)
