@@ -37,14 +37,15 @@ def test_the_average_follows_the_weights(found):
         torch.testing.assert_close(new, old + 0.005)
 
 
-def dataset_policy(found, root, episodes=None, place=None, **options):
+def dataset_policy(found, root, episodes=None, place=None, streamed=False, **options):
     """As lerobot-train makes it, which names the dataset's metadata alone; and that dataset."""
-    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
     from lerobot.policies.factory import make_policy
 
     config = found["warm_flow"].config_class(embedding_dim=24, num_layers=1, device="cpu", **options)
     config.pretrained_path = place
-    dataset = LeRobotDataset("local/tiny", root=root, episodes=episodes)
+    kind = StreamingLeRobotDataset if streamed else LeRobotDataset
+    dataset = kind("local/tiny", root=root, episodes=episodes)
     return make_policy(config, ds_meta=dataset.meta), dataset
 
 
@@ -62,14 +63,17 @@ def test_it_is_preconditioned_for_the_episodes_of_the_training(found, tmp_path):
 
     root = tmp_path / "data"
     write_lerobot(root, (12, 12, 12), resting=["action"], data_files_size_in_mb=0.001)
-    for episodes in ([0, 2], None):
-        policy, dataset = dataset_policy(found, root, episodes)
+    for episodes, streamed in (([0, 2], False), ([0, 2], True), (None, False)):
+        policy, dataset = dataset_policy(found, root, episodes, streamed=streamed)
         expected = moments_by_hand(policy, dataset, episodes or [0, 1, 2])
         torch.testing.assert_close(policy.actor.network.moments.state_dict(), expected)
     alone = found["warm_flow"](policy.config, dataset_meta=LeRobotDatasetMetadata("local/tiny", root=root))
     torch.testing.assert_close(alone.actor.network.moments.state_dict(), expected)
     (root / "data/chunk-000/file-001.parquet").unlink()
     dataset_policy(found, root, [0, 2])
+    (root / "data").rename(tmp_path / "on the hub")
+    with raises(ValueError, str(root), "--dataset.streaming=false", "--policy.precondition=false"):
+        found["warm_flow"](policy.config, dataset_meta=dataset.meta)
 
 
 def test_a_training_that_goes_on_has_the_moments_of_its_own_data(found, tmp_path):

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
 from lerobot.processor import NormalizerProcessorStep, TransitionKey
@@ -47,7 +47,8 @@ def training_episodes(meta: Any) -> list[int] | None:
 
     LeRobot gives a policy only the metadata of all episodes, so the dataset that holds them is searched.
     """
-    datasets = (o for o in gc.get_objects() if issubclass(type(o), LeRobotDataset))
+    kinds = LeRobotDataset, StreamingLeRobotDataset
+    datasets = (o for o in gc.get_objects() if issubclass(type(o), kinds))
     dataset = next((o for o in datasets if o.meta is meta), None)
     return None if dataset is None else dataset.episodes
 
@@ -153,6 +154,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             raise ValueError(
                 f"the preconditioning is fitted to actions that are normalised by MIN_MAX, not by {mode}: "
                 "choose that, or --policy.precondition=false"
+            )
+        if not any(dataset_meta.root.glob("data/*/*.parquet")):
+            raise ValueError(
+                f"the preconditioning is fitted to the steps of a dataset, and {dataset_meta.root} has none: "
+                "set --dataset.streaming=false, or --policy.precondition=false"
             )
         episodes = training_episodes(dataset_meta)
         chosen: Any = {"observation_keys": self.config.observed, "episodes": episodes}
