@@ -48,7 +48,9 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
     f"square, {MANY}": (SHORT[0], LONG[0]),
     f"transport, {MANY}": (SHORT[1], LONG[1]),
     "can, 25 of six operators": ("can_mh_25_10000", "can_mh_25_80000"),
+    "can, 150 of six operators": ("can_mh_150_10000", "can_mh_150_80000"),
     "door, 25 human": ("door_20000", "door_80000"),
+    "Push-T, 50 human": ("pusht_50", "pusht_50_80000"),
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),
 }
 WARM = (PAST, PREVIEW, CORRELATED)
@@ -109,7 +111,7 @@ def steps() -> None:
 
 def iterations() -> None:
     """Draw chart C: success against the length of the training."""
-    picture, axes = figure(WIDTH, 9.4, 2, "Success against the length of the training", rows=3)
+    picture, axes = figure(WIDTH, 12.4, 2, "Success against the length of the training", rows=4)
     for spare in axes[len(LENGTHS) :]:
         spare.remove()
     for axis, (name, runs) in zip(axes, LENGTHS.items(), strict=False):
@@ -139,14 +141,16 @@ def table() -> str:
 
 
 def lengths_table() -> str:
-    """Return success after trainings of several lengths in Markdown, of the seeds that all lengths have."""
+    """Return success after short and long trainings in Markdown, of the seeds that both lengths have."""
     names = (GAUSSIAN, *WARM)
     text = [f"| demonstrations | iterations | seeds | {' | '.join(SOURCES[name][0] for name in names)} |"]
     text.append("|---" * (3 + len(names)) + "|")
     for name, runs in LENGTHS.items():
-        for length, part in read_cells(runs, common_seeds=True).groupby("iterations"):
-            entries = [at_nine_three_one(part, source) for source in names]
-            text.append(f"| {name} | {length:,} | {part['seeds'].max()} | {' | '.join(entries)} |")
+        lengths = dict(list(read_cells(runs, common_seeds=True).groupby("iterations")))
+        entries = [" → ".join(at_nine_three_one(p, source) for p in lengths.values()) for source in names]
+        iterations = " → ".join(f"{length:,}" for length in lengths)
+        seeds = max(part["seeds"].max() for part in lengths.values())
+        text.append(f"| {name} | {iterations} | {seeds} | {' | '.join(entries)} |")
     return "\n".join(text) + "\n"
 
 
