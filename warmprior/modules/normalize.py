@@ -46,6 +46,13 @@ class FloatScaling(ActionScaling):
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
         return super()._inv_apply_transform(action).to(action.dtype)
 
+    def transform_action_spec(self, action_spec: Composite) -> Composite:
+        """Set the spec of the normalised action, which has the width of the statistics."""
+        for key in self.in_keys_inv:
+            if key in action_spec.keys(True, True):
+                check_width(key, action_spec[key].shape, self.loc)  # one number would fit any width
+        return super().transform_action_spec(action_spec)
+
 
 def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
     """Raise ValueError unless values ``[*B, d]`` have the width of their statistics ``[d]``."""
