@@ -1,6 +1,7 @@
 import math
 import shutil
 import sys
+from functools import partial
 from types import ModuleType
 
 import h5py
@@ -11,6 +12,7 @@ from tensordict import NonTensorStack, TensorDict
 from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
+from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend, RestingJoints
 from warmprior.envs import NavigationEnv
@@ -214,6 +216,19 @@ def test_data_that_cannot_be_are_named():
         task = Task.of("own", steps(**fitting | changed), NavigationEnv)
         with raises(ValueError, "own human", f"'{next(iter(changed))}'"):
             task.check_environment()
+
+
+def test_an_environment_with_images_fits_its_demonstrations():
+    def pictured(size, action_dim):
+        seen = {"state": torch.rand(40, 4), "cam": torch.zeros(40, 3, size, size, dtype=torch.uint8)}
+        changed = {"observation": TensorDict(seen, [40]), "action": torch.rand(40, action_dim)}
+        return Task.of("own", steps(**changed), partial(CameraEnv, 7))
+
+    pictured(10, 2).check_environment()
+    # One action would be given to both dimensions of the environment's.
+    for size, action_dim, named in ((12, 2, "'cam'"), (10, 1, "'action'")):
+        with raises(ValueError, "own human", named):
+            pictured(size, action_dim).check_environment()
 
 
 @pytest.mark.parametrize(

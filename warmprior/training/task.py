@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
@@ -392,15 +393,11 @@ class Task:
             for key in (self.success, *self.measures):
                 if key not in present:
                     raise ValueError(f"it does not write {key!r} next to its reward: it writes {present}")
-            widths = {"observation": self.vector.shape[-1], "action": self.data[ACTION].shape[-1]}
-            specs = {"observation": base.observation_spec, "action": env.full_action_spec}
-            for (name, width), place in zip(widths.items(), (OBSERVATION, CHUNK), strict=True):
-                spec = specs[name]
-                shape = spec[place].shape[-1:] if place in spec.keys(True, True) else None
-                if shape != (width,):
-                    raise ValueError(
-                        f"its {name!r} has the width {shape}, but that of the demonstrations is {width}"
-                    )
+            specs = dict(env.observation_spec.items(True, True)) | {ACTION: env.full_action_spec[CHUNK]}
+            for key, value in self.data.select(OBSERVATION, ACTION).items(True, True):
+                found = _form(specs[key]) if key in specs else "missing"
+                if found != (expected := _form(value)):
+                    raise ValueError(f"its {key!r} is {found}, but that of the demonstrations {expected}")
             env.set_seed(0)
             env.step(env.reset().set(CHUNK, self.data[ACTION][:1].to("cpu")))
         except ImportError:
@@ -457,6 +454,11 @@ class Task:
         if not isinstance(observation, TensorDictBase):
             return {}
         return {name: int(value.shape[-1]) for name, value in observation.items() if name != STATE}
+
+
+def _form(entry: Tensor | TensorSpec) -> str:
+    """Return the shape of an entry of stacks, chunks or steps, and the type of images."""
+    return f"{list(entry.shape[1:])}{' of uint8' if entry.dtype == torch.uint8 else ''}"
 
 
 def _no_environment() -> EnvBase:
