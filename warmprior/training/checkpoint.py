@@ -74,8 +74,15 @@ def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         value = tensors[name]
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy())
+        digest.update(_bytes(value))
     return digest.hexdigest()
+
+
+def _bytes(value: Tensor) -> memoryview:
+    """Return a tensor's values as bytes."""
+    # Copied, because an expanded number counts as contiguous, but has no stride.
+    flat = value.reshape(-1).cpu().clone(memory_format=torch.contiguous_format)
+    return memoryview(flat.view(torch.uint8).numpy())
 
 
 @contextmanager
@@ -199,5 +206,5 @@ def data_digest(data: TensorDictBase) -> str:
         digest.update(str(key).encode())
         rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # an entry may be larger than the memory
         for part in value.split(rows):
-            digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
+            digest.update(_bytes(part))
     return digest.hexdigest()[:16]
