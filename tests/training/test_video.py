@@ -48,16 +48,17 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
 
 
 class DrawnDial(Dial):
-    """It draws pictures as bright as the steps that it took."""
+    """It draws pictures as bright as the steps that it took, always into the same memory."""
 
-    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 5}
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 2.5}
 
     def __init__(self, render_mode=None):
         super().__init__()
-        self.render_mode = render_mode
+        self.render_mode, self.picture = render_mode, np.empty((8, 8, 3), np.uint8)
 
     def render(self):
-        return np.full((8, 8, 3), self.turns, np.uint8)
+        self.picture.fill(self.turns)
+        return self.picture
 
 
 def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypatch):
@@ -73,7 +74,8 @@ def test_a_policy_of_gymnasium_is_recorded_by_its_environment(tmp_path, monkeypa
     assert [int(frame[0, 0, 0]) for frame in strip.frames] == strip.steps == [0, 1, 2, 3, 4]
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
-        assert (stream.average_rate, stream.frames) == (5, 5)
-    bare = environment_of(actor)
-    with raises(ValueError, "render_mode"):
-        record_filmstrip(actor, seed=0, frames=2, env=bare)
+        assert (stream.average_rate, stream.frames) == (2.5, 5)
+    for mode, picture in ((None, 0), ("rgb_array", [np.zeros((8, 8, 3), np.uint8)]), ("rgb_array", 0.5)):
+        monkeypatch.setattr(DrawnDial, "render", lambda self, picture=picture: picture)
+        with raises(ValueError, "render_mode"):
+            record_filmstrip(actor, seed=0, frames=2, env=environment_of(actor, render_mode=mode))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,13 +34,13 @@ class _Recorder(EnvTransform):
         return next_tensordict
 
 
-def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: int) -> None:
+def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: float) -> None:
     """Write a video with ``rate`` pictures per second."""
     av = require("av", "lerobot")
 
     def write(temporary: Path) -> None:
         with av.open(str(temporary), "w", format="mp4") as container:
-            stream = container.add_stream("h264", rate=rate)
+            stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(1000))
             stream.width = stream.height = size
             stream.pix_fmt = "yuv420p"
             for picture in pictures:
@@ -61,10 +62,11 @@ def _picture(env: Any) -> np.ndarray:
         picture = env.render() if getattr(env, "render_mode", "rgb_array") is not None else None
     except NotImplementedError:
         picture = None
-    if picture is None:
+    picture = np.array(picture)  # copied, because an environment may draw all into one buffer
+    if picture.dtype != np.uint8 or picture.ndim > 3:
         raise ValueError(
-            "the environment draws no pictures: make it with render_mode='rgb_array', or request no videos "
-            "(video_rate=None)"
+            "the environment draws no pictures, uint8 [h, w, 3]: make it with render_mode='rgb_array', or "
+            "request no videos (video_rate=None)"
         )
     return picture
 
@@ -101,7 +103,7 @@ def record_filmstrip(
     size: int = 160,
     video: Path | None = None,
     env: TransformedEnv | None = None,
-    rate: int | None = None,
+    rate: float | None = None,
     **options: Any,
 ) -> Filmstrip:
     """Play the same episode as :func:`play_episode`, and render evenly spaced control steps.
