@@ -137,6 +137,8 @@ def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, c
     )
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["NFE 1", "NFE 3"]
+    with pytest.warns(UserWarning, match="Pendulum-v1 has no time limit.*horizon"):
+        Task.open(f"minari:{name}", horizon=-1).make_env()
 
 
 def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):

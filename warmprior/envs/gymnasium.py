@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -191,6 +192,9 @@ def registered_env(
         max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
         **kwargs | ({} if render_mode is None else {"render_mode": render_mode}),
     )
+    if env.spec.max_episode_steps is None:
+        unlimited = f"{name} has no time limit, so an episode may never end: give a horizon"
+        warnings.warn(unlimited, stacklevel=2)
     success = description.get("success")
     made = gym_env(
         env,
