@@ -52,14 +52,21 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
     assert replay.env_args == modernize_env_args(env_args_15(task))
 
 
-def test_data_is_the_storage(square_file, tmp_path):
+def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
     path, _ = square_file
-    for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path / "maps"}):
-        replay = RobomimicDemonstrations(path, batch_size=7, **options)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    mapped = {"storage": "memmap"}
+    maps = mapped | {"scratch_dir": tmp_path / "maps"}
+    replays = [RobomimicDemonstrations(path, batch_size=7, **options) for options in ({}, mapped, maps, maps)]
+    for number, replay in enumerate(replays):
         assert replay.data["action"].data_ptr() == replay.data["action"].data_ptr()
-        replay.data["action"].fill_(0.25)
-        assert (replay.sample()["action"] == 0.25).all()
-    assert list((tmp_path / "maps").rglob("*.memmap"))
+        replay.data["action"].fill_(number)
+    for number, replay in enumerate(replays):  # two have their files in one folder
+        assert (replay.sample()["action"] == number).all()
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    places = [Path(line.split()[5]).parents[1] for line in lines if "/action.memmap" in line]
+    assert sorted(places) == [tmp_path, tmp_path / "maps", tmp_path / "maps"]
+    assert not list(tmp_path.rglob("*.memmap"))  # without names, they go with the process
 
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):

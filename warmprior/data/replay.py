@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -263,14 +264,18 @@ def _allocate(
         )
     if storage == "memory":
         return torch.empty_like(data)
-    data = data.memmap_like(scratch_dir)
     try:
-        for value in data.values(True, True):
-            _reserve(value)
+        if scratch_dir is not None:
+            Path(scratch_dir).mkdir(parents=True, exist_ok=True)
+        # A folder of its own, because another reader may use the same one; a map outlives its file's name.
+        with TemporaryDirectory(dir=scratch_dir, ignore_cleanup_errors=True) as folder:
+            data = data.memmap_like(folder)
+            for value in data.values(True, True):
+                _reserve(value)
     except OSError as error:
         raise OSError(
             f"{scratch_dir or 'the folder of temporary files'}: cannot store {needed / 1e9:.3g} GB for "
-            f"{index.path} ({error}): free some space or choose another scratch_dir"
+            f"{index.path} ({error}): free some space, or choose another scratch_dir (TMPDIR)"
         ) from error
     return data
 
@@ -283,8 +288,7 @@ def _reserve(mapped: Any) -> None:
     """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
     if not hasattr(os, "posix_fallocate"):
         return
-    handler = getattr(mapped, "_handler", None)  # set for a file without a name
-    file = os.open(mapped.filename, os.O_RDWR) if handler is None else os.dup(handler.fd)
+    file = os.open(mapped.filename, os.O_RDWR)
     try:
         os.posix_fallocate(file, 0, max(1, mapped.numel() * mapped.element_size()))
     finally:

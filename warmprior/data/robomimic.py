@@ -39,8 +39,8 @@ class RobomimicDemonstrations(DemonstrationReplay):
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm. Recorded poses that
             the file declares as deltas (``low_dim_abs.hdf5``) are not changed.
         as_recorded: True reads such poses without ``absolute_actions`` too, as stored in the file.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default temporary ones.
-        scratch_dir: a folder for memory maps.
+        storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk.
+        scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
         **kwargs: TorchRL's ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` and
             ``generator``.
 
