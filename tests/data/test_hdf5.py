@@ -42,7 +42,7 @@ def test_an_unknown_environment_has_what_it_finds(tmp_path):
         for demo in file["data"].values():
             steps = len(demo["actions"])
             del demo["obs/robot1_eef_quat"]
-            demo["obs/goal"] = np.full((steps, 2), 0.25)
+            demo["obs/robot_goal"] = np.full((steps, 2), 0.25)
             demo["obs/door_open"] = np.zeros(steps, bool)
             demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
             demo["obs/language"] = np.array([b"open"] * steps)
@@ -51,7 +51,7 @@ def test_an_unknown_environment_has_what_it_finds(tmp_path):
     assert index.task is None and index.action_dim == 14
     assert index.observation_keys == (
         *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
-        *("robot1_eef_pos", "robot1_gripper_qpos", "door_open", "goal"),
+        *("robot1_eef_pos", "robot1_gripper_qpos", "door_open", "robot_goal"),
     )
     assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
     for nothing in [], ():

@@ -337,7 +337,7 @@ def read_index(
             keys = task.low_dim_keys
         else:
             usual = [key for key in low_dim_keys(arms=2) if key in available]
-            others = [key for key in available if key not in usual and not key.startswith("robot")]
+            others = [k for k in available if k not in usual and not k.startswith(("robot0_", "robot1_"))]
             keys = (*usual, *(key for key in others if _is_vector(observations, key)))
         obs_names = [f"obs/{key}" for key in keys]
         if poses:
