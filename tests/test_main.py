@@ -1,8 +1,9 @@
 import shutil
+import sys
 
 import pytest
 
-from tests.data.synthetic import write_robomimic_file
+from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import missing
 from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
@@ -172,6 +173,17 @@ def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):
     assert "NFE 1:" in said and "NFE 3:" not in said and "--nfe 1\n" in said
     sampling = load_policy(said.splitlines()[-1]).sampling
     assert sampling.nfe == sampling.max_nfe == 1
+
+
+@pytest.mark.parametrize(("task", "env_name"), [("lift", "MyKitchen"), ("stack_d0", "Stack_D0")])
+def test_train_needs_no_simulator(tmp_path, capsys, monkeypatch, task, env_name):
+    monkeypatch.setitem(sys.modules, "mimicgen", None)
+    path = tmp_path / "own.hdf5"
+    write_robomimic_file(path, task=task, env_args=env_args_15(task) | {"env_name": env_name})
+    words = f"train {path} --out {tmp_path} --iterations 2 --hidden-dim 8"
+    assert main(words.split()) == 0
+    said = capsys.readouterr().out
+    assert "only trained" in said and load_policy(said.splitlines()[-1]).environment is not None
 
 
 @pytest.mark.parametrize(

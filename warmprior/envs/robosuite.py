@@ -71,7 +71,7 @@ class RobosuiteEnv(EnvBase):
         device: device of the tensordicts.
 
     Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not and the task is one of its tasks.
+        ImportError: if robosuite, or the package of the environment, is not installed or imported.
         ValueError: if the task is unknown, not exactly one of ``task``, ``env_args`` and ``env`` is given, an
             option is out of range, an observation does not exist, or the lean loop does not support the
             robots.

@@ -220,7 +220,6 @@ class Task:
         from warmprior.data.opening import name_of_place
         from warmprior.envs.description import registered_description
         from warmprior.envs.gymnasium import registered_env
-        from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.training import files
 
         outcome = given(success=success, measures=measures, video_rate=video_rate)
@@ -265,8 +264,6 @@ class Task:
         name = files.task_name(index)
         if task not in (None, name):
             raise ValueError(f"{place} holds demonstrations of {name}, not of {task}: correct the task")
-        if is_mimicgen(index.env_args["env_name"]):
-            find_mimicgen()
         dataset, images = files.read_steps(
             demonstrations,
             absolute_actions=actions == "absolute",
