@@ -121,18 +121,11 @@ def _features(
     names = {"action": action_names(arms) if poses else None}
     names |= {name: state_names(widths) for name, widths in layout.items()}
     sizes = {"action": index.action_dim} | {name: sum(w.values()) for name, w in layout.items()}
-    pixels = (index.image_size, index.image_size, 3)
-    return (
-        {name: feature("float32", (size,), names[name]) for name, size in sizes.items()}
-        | {
-            name: feature("bool" if value.dtype == torch.bool else "float32", (1,), None)
-            for name, value in outcome.items()
-        }
-        | {
-            _camera(key): feature(str(images), pixels, ["height", "width", "channels"])
-            for key in index.image_keys
-        }
-    )
+    features = {name: feature("float32", (size,), names[name]) for name, size in sizes.items()}
+    kinds = {name: "bool" if value.dtype == torch.bool else "float32" for name, value in outcome.items()}
+    features |= {name: feature(kind, (1,), None) for name, kind in kinds.items()}
+    pixels, sides = (index.image_size, index.image_size, 3), ["height", "width", "channels"]
+    return features | {_camera(key): feature(str(images), pixels, sides) for key in index.image_keys}
 
 
 def _camera(key: str) -> str:

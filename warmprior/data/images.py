@@ -15,7 +15,7 @@ from warmprior.data.opening import Demonstrations
 from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, rendering_backend
-from warmprior.envs.simulator import check_scene_stays, make_simulator
+from warmprior.envs.simulator import make_simulator, scene_stays
 from warmprior.keys import OBSERVATION
 
 RENDERER_VERSION = 2
@@ -40,10 +40,9 @@ class StateRenderer:
     def renderer(self) -> CameraRenderer:
         """The renderer of the simulator's model, in which nothing may depend on a reset."""
         env = make_simulator(modernize_env_args(self.index.env_args))
-        try:
-            check_scene_stays(env)
-        except ValueError as error:
-            raise DatasetError(f"{self.index.path}: {error}: images do not follow from states") from error
+        if not scene_stays(env):
+            what = f"{type(env).__name__} moves fixtures at resets: images do not follow from states"
+            raise DatasetError(f"{self.index.path}: {what}")
         model = env.sim.model._model
         return CameraRenderer(model, self.size, self.size, fast=self.fast)
 

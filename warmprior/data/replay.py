@@ -288,11 +288,8 @@ def _reserve(mapped: Any) -> None:
     """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
     if not hasattr(os, "posix_fallocate"):
         return
-    file = os.open(mapped.filename, os.O_RDWR)
-    try:
-        os.posix_fallocate(file, 0, max(1, mapped.numel() * mapped.element_size()))
-    finally:
-        os.close(file)
+    with open(mapped.filename, "r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
 
 
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:

@@ -128,11 +128,10 @@ def gym_env(
             "environment in gymnasium.wrappers.FlattenObservation"
         )
     floats = torch.float32, torch.float64
-    cast = {key: spec.dtype for key, spec in specs.items() if ndims[key] == 1 and spec.dtype not in floats}
     transforms = [DoubleToFloat()]
-    for dtype in set(cast.values()):
-        names = [present[key] for key, found in cast.items() if found == dtype]
-        transforms.append(DTypeCastTransform(dtype, torch.float32, in_keys=names))
+    for key, spec in specs.items():
+        if ndims[key] == 1 and spec.dtype not in floats:
+            transforms.append(DTypeCastTransform(spec.dtype, torch.float32, in_keys=[present[key]]))
     if chosen != [OBSERVATION]:
         transforms.append(CatTensors([present[key] for key in chosen], OBSERVATION, sort=False))
     return TransformedEnv(base, Compose(*transforms))
@@ -195,8 +194,7 @@ def registered_env(
         **kwargs | ({} if render_mode is None else {"render_mode": render_mode}),
     )
     if env.spec.max_episode_steps is None:
-        unlimited = f"{name} has no time limit, so an episode may never end: give a horizon"
-        warnings.warn(unlimited, stacklevel=2)
+        warnings.warn(f"{name} has no time limit: episodes may never end without a horizon", stacklevel=2)
     success = description.get("success")
     made = gym_env(
         env,

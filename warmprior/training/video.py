@@ -154,9 +154,8 @@ def record_filmstrip(
         else:
             require_rendering()
         env = environment_of(actor, **options)
-    frame: Callable[[Any, int], np.ndarray]
-    quick: Callable[[Any, int], np.ndarray]
-    frame = quick = _resized
+    frame: Callable[[Any, int], np.ndarray] = _resized
+    quick: Callable[[Any, int], np.ndarray] = _resized
     if renders_itself:
         look = partial(_picture, env.base_env)
         rate = rate or getattr(env.base_env, "metadata", {}).get("render_fps")

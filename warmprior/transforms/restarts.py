@@ -22,9 +22,6 @@ NATIVE = "_torchrl_native_autoreset"
 """TorchRL's name of environments whose steps return the next episode's first observation at an end."""
 
 
-_BY_THEMSELVES = (AutoResetTransform, VecGymEnvTransform)
-
-
 class Restarts:
     """The restarts of rows whose episode has ended, while the other rows of a batch go on.
 
@@ -53,7 +50,7 @@ class Restarts:
         several = simulator.numel() > 1
         self.native = several and bool(container.__dict__.get(NATIVE, False))
         self.needed = several and self._mode == "DISABLED"
-        alone = any(isinstance(t, _BY_THEMSELVES) for t in below)
+        alone = any(isinstance(t, AutoResetTransform | VecGymEnvTransform) for t in below)
         self._alone = several and alone and not self.native
         self._whole_workers = isinstance(simulator, BatchedEnvBase) and simulator.batch_size[1:].numel() > 1
 

@@ -159,10 +159,9 @@ def _checked(
 def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
     """Return the first and the last step of every step's episode, each ``[N]``."""
     values, lengths = torch.unique_consecutive(episode, return_counts=True)
-    if len(values.unique()) != len(values):
-        repeated = values.sort().values
-        repeated = repeated[1:][repeated[1:] == repeated[:-1]]
-        number = int(repeated[0])
+    numbers, times = values.unique(return_counts=True)
+    if (times > 1).any():
+        number = int(numbers[times > 1][0])
         raise ValueError(f"the steps of episode {number} are not contiguous: order all by episode and time")
     last = lengths.cumsum(0) - 1
     first = last - lengths + 1
