@@ -104,8 +104,8 @@ def gym_env(
     """
     base = _Gym(env, categorical_action_encoding=True)
     # TorchRL reads all entries of info of vector environments that restart rows.
-    told = {key for reader in base.info_dict_reader for key in reader.info_spec.keys(True, True)}
-    seen = [key for key in base.observation_spec.keys(True, True) if key not in told]
+    in_info = {key for reader in base.info_dict_reader for key in reader.info_spec.keys(True, True)}
+    seen = [key for key in base.observation_spec.keys(True, True) if key not in in_info]
     present = {key if isinstance(key, str) else "/".join(key): key for key in seen}
     chosen = list(observation_keys) or list(present)
     if missing := [key for key in chosen if key not in present]:
