@@ -10,14 +10,15 @@ episodes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from pages import write
-from pandas import DataFrame, Series
+from pandas import DataFrame, Series, concat
 from shared import (
     CORRELATED,
+    DATA,
     DOCS,
     GAUSSIAN,
     INK,
@@ -31,12 +32,15 @@ from shared import (
     finish,
     lines,
     read_cells,
+    read_played,
     save,
     shown_sources,
     wilson,
+    with_own_noise,
 )
 
 from lab.paper import PAPER_SUCCESS, STATE
+from lab.statistics import chosen_elsewhere
 
 PAGE = DOCS / "results.md"
 TEN, TWENTY_FIVE, MANY = "10", "25", "300 of six operators"
@@ -154,6 +158,51 @@ def lengths_table() -> str:
     return "\n".join(text) + "\n"
 
 
+def outcomes_by_length(runs: tuple[str, str], source: str, nfe: int) -> dict[str, np.ndarray]:
+    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of the seeds that all have.
+
+    Runs that trained fewer sources again, with another seed, are called ``_second``.
+    """
+    parts = [(run, name) for run in runs for name in (run, f"{run}_second")]
+    found = [(run, name) for run, name in parts if (DATA / f"{name}.jsonl").is_file()]
+    rows = concat([with_own_noise(read_played(name)).assign(run=run) for run, name in found])
+    rows = rows[rows["source"].isin((source, GAUSSIAN)) & (rows["nfe"] == nfe)]
+    solved = rows.pivot(index="seed", columns=["source", "run"], values="solved").dropna()
+    return {s: np.stack([np.concatenate(list(solved[s, run])) for run in runs]) for s in (source, GAUSSIAN)}
+
+
+def all_lengths(source: str, choose: Callable[[np.ndarray], np.ndarray]) -> tuple[str, str, str]:
+    """Return the mean success of a source over all sets, that of the Gaussian source, and their pairs.
+
+    `choose` takes the outcomes after each length, and returns those of one. The texts are for NFE 9, 3 and 1.
+    """
+    texts = []
+    for nfe in (9, 3, 1):
+        played = [outcomes_by_length(runs, source, nfe) for runs in LENGTHS.values()]
+        pairs = [[choose(of[name]) for name in (source, GAUSSIAN)] for of in played]
+        means = 100 * np.mean([[outcomes.mean() for outcomes in pair] for pair in pairs], 0) + 1e-6
+        won, lost = (sum((ahead * (a - b) > 0).sum() for a, b in pairs) for ahead in (1, -1))
+        texts.append((*(f"{mean:.0f}" for mean in means), f"{won}:{lost}"))
+    success, base, counts = zip(*texts, strict=True)
+    return "/".join(success), "/".join(base), ", ".join(counts)
+
+
+CHOICES = {"long training": lambda outcomes: outcomes[-1], "better length": chosen_elsewhere}
+"""After which training a source is played; the better length is chosen per set and NFE, on other episodes."""
+
+
+def sets_table() -> str:
+    """Return the mean success of warm sources over all sets in Markdown, beside the Gaussian source's."""
+    text = [
+        "| | " + " | ".join(f"{choice} | {SOURCES[GAUSSIAN][0]} | won : lost" for choice in CHOICES) + " |"
+    ]
+    text.append("|---" * (1 + 3 * len(CHOICES)) + "|")
+    for source in WARM:
+        entries = [entry for choose in CHOICES.values() for entry in all_lengths(source, choose)]
+        text.append(f"| {SOURCES[source][0]} | {' | '.join(entries)} |")
+    return "\n".join(text) + "\n"
+
+
 def paper_table() -> str:
     """Return the paper's Table 1 and these rows in Markdown: success at NFE 9 / 3 / 1."""
 
@@ -180,8 +229,8 @@ def paper_table() -> str:
 def tables() -> dict[Path, list[str]]:
     """Return the tables of each page in their order; the lab notes have those of runs alone."""
     return {
-        PAGE: [table(), lengths_table()],
-        DOCS / "notes" / "evidence.md": [],
+        PAGE: [table(), sets_table()],
+        DOCS / "notes" / "evidence.md": [lengths_table()],
         DOCS / "paper.md": [paper_table()],
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 from leaderboard import SCRIPTED, pairs, standings, trials
 from pages import own_best
 from pandas import DataFrame
-from results import GROUPS, LONG, SHORT, TEN, TWENTY_FIVE, WARM
+from results import CHOICES, GROUPS, LONG, SHORT, TEN, TWENTY_FIVE, WARM, all_lengths
 from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
 
 
@@ -58,8 +58,14 @@ def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
 
 
 def in_words(pair_of_counts: str) -> str:
-    """Return ``a : b`` as ``a won, b lost``."""
-    return pair_of_counts.replace(" :", " won,") + " lost"
+    """Return ``a : b`` or ``a:b`` as ``a won, b lost``."""
+    won, lost = pair_of_counts.split(":")
+    return f"{won.strip()} won, {lost.strip()} lost"
+
+
+def spaced(rates: str) -> str:
+    """Return ``a/b/c`` as a sentence has it, ``a / b / c``."""
+    return rates.replace("/", " / ")
 
 
 def mean(runs: Iterable[str], source: str, nfe: int) -> float:
@@ -78,7 +84,7 @@ def sentences() -> dict[str, list[str]]:
     board = standings().set_index(["source", "nfe"])
     few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
-    correlated = {nfe: whole(abs(gain(LONG, CORRELATED, nfe))) for nfe in (9, 3, 1)}
+    long, better = (all_lengths(PAST, choose) for choose in CHOICES.values())
     lengths = read_cells((SHORT[-1], LONG[-1]), common_seeds=True).query("nfe == 1")
     transport = [
         whole(lengths[(lengths["run"] == runs[-1]) & (lengths["source"] == s)]["success"].mean())
@@ -139,9 +145,9 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
             f"(WP-Past with 25: {in_words(pair(GROUPS[TWENTY_FIVE], PAST, 1))})",
             f"{span(short)} points less often at one step after 10,000 iterations",
-            f"succeeds {correlated[9]} points more often at nine steps "
-            f"({in_words(pair(LONG, CORRELATED, 9))}) "
-            f"and {correlated[3]} at three, {correlated[1]} less often at one",
+            f"it solves {spaced(long[0])}% at nine, three",
+            f"the Gaussian source {spaced(long[1])} ({in_words(long[2].split(', ')[0])} at nine)",
+            f"{spaced(better[0])} and {spaced(better[1])} (table)",
         ],
         "which_source.md": [
             f"{span(joints)}% at three steps",
@@ -178,10 +184,6 @@ def sentences() -> dict[str, list[str]]:
             f"and with 50 ({pair(['pusht_50'], PAST, 9)})",
         ],
         "results.md": [
-            f"WP-Past solves {transport[3]}% on transport and the Gaussian source "
-            f"{transport[2]}, where they solve {transport[1]} and {transport[0]} after 10,000",
-            f"({pair(LONG, CORRELATED, 9)} at nine steps, {pair(LONG, CORRELATED, 3)} at three, "
-            f"{pair(LONG, CORRELATED, 1)} at one)",
             f"on transport at nine ({pair([LONG[-1]], PREVIEW, 9)})",
         ],
         "faq.md": [f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0)"],
