@@ -1,6 +1,7 @@
 """HDF5 files that point elsewhere, declare what they do not hold, or hold what no robot could."""
 
 import errno
+import gc
 import json
 import os
 import struct
@@ -180,3 +181,5 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
     monkeypatch.setattr("warmprior.data.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled"))
     with raises(OSError, "GB", "scratch_dir"):
         RobomimicDemonstrations(path, **options)
+    gc.collect()
+    assert len(list(tmp_path.rglob("action.memmap"))) == named  # those of the data alone

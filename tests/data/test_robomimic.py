@@ -1,3 +1,5 @@
+import gc
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -10,6 +12,7 @@ from torchrl.data import SliceSampler
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.processes import apart
 from warmprior.data import RobomimicDemonstrations
 from warmprior.envs import absolute_actions, modernize_env_args
 from warmprior.envs.tasks import TASKS
@@ -63,11 +66,17 @@ def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
         replay.data["action"].fill_(number)
     for number, replay in enumerate(replays):  # two have their files in one folder
         assert (replay.sample()["action"] == number).all()
-    lines = Path("/proc/self/maps").read_text().splitlines()
-    own = [line.split()[5] for line in lines if f"{tmp_path}/" in line]
-    places = [Path(file).parents[1] for file in own if file.endswith("/action.memmap")]
-    assert sorted(places) == [tmp_path, tmp_path / "maps", tmp_path / "maps"]
-    assert not list(tmp_path.rglob("*.memmap"))  # without names, they go with the process
+    sent = [pickle.loads(pickle.dumps(replay.data)) for replay in replays]  # as to a worker process
+    assert [data["action"].unique().tolist() for data in sent] == [[0], [1], [2], [3]]
+    apart(lambda: sent.append(RobomimicDemonstrations(path, **mapped)))()  # a worker leaves nothing
+    files = sorted(tmp_path.rglob("action.memmap"))
+    assert [file.parents[1] for file in files] == [tmp_path / "maps"] * 2 + [tmp_path]
+    part = replays[-1].data[:1].select("action")
+    del replay, replays
+    gc.collect()
+    assert len(list(tmp_path.rglob("action.memmap"))) == 1 and (part["action"] == 3).all()
+    del part
+    assert not list(tmp_path.rglob("*.memmap"))
 
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):

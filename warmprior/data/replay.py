@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from multiprocessing.util import Finalize
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -256,22 +258,25 @@ def _allocate(
     for key, (dtype, width) in widths.items():
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
     needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
-    available = available_memory()
-    if storage == "memory" and needed > available:
-        raise DatasetError(
-            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB "
-            "are free: use storage='memmap' or fewer demos"
-        )
     if storage == "memory":
+        if needed > (free := available_memory()):
+            raise DatasetError(
+                f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but {free / 1e9:.1f} GB "
+                "are free: use storage='memmap' or fewer demos"
+            )
         return torch.empty_like(data)
     try:
         if scratch_dir is not None:
             Path(scratch_dir).mkdir(parents=True, exist_ok=True)
-        # A folder of its own, because another reader may use the same one; a map outlives its file's name.
-        with TemporaryDirectory(dir=scratch_dir, ignore_cleanup_errors=True) as folder:
-            data = data.memmap_like(folder)
-            for value in data.values(True, True):
-                _reserve(value)
+        # A folder of its own, because another reader may use the same one. It is removed by this process
+        # alone, also where the end of a worker process calls no other finalizers.
+        folder = tempfile.mkdtemp(dir=scratch_dir)
+        data = data.memmap_like(folder)
+        left: list[str] = []
+        for value in data.values(True, True):
+            left.append(value.filename)
+            Finalize(value.untyped_storage(), _release, (folder, left), exitpriority=0)
+            _reserve(value)
     except OSError as error:
         raise OSError(
             f"{scratch_dir or 'the folder of temporary files'}: cannot store {needed / 1e9:.3g} GB for "
@@ -290,6 +295,13 @@ def _reserve(mapped: Any) -> None:
         return
     with open(mapped.filename, "r+b") as file:
         os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
+
+
+def _release(folder: str, left: list[str]) -> None:
+    """Remove a folder after the last of its memory maps; processes that these are sent to open the files."""
+    left.pop()
+    if not left:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:
