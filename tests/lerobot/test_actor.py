@@ -103,6 +103,18 @@ def test_several_observations_and_the_lead_of_a_chunk(policy):
         actor(short)
 
 
+def test_tokens_may_be_observations_and_states_whole_numbers(policy):
+    made, prior = policy("smolvla"), PastPrior(LENGTH)
+    seen = {"state": torch.arange(STATE).expand(2, 1, STATE), "top": torch.zeros(2, 1, 3, 64, 64).byte()}
+    data = TensorDict({"observation": seen, "history": history_of(torch.randn(2, LENGTH, ACTION))}, [2])
+    expected = actor_of(made, prior)(data.clone())["vla_action", "chunk"]
+    more = {name: f"observation.language.{name}" for name in ("tokens", "attention_mask")}
+    for name, value in zip(more, (torch.tensor(7), torch.tensor(True)), strict=True):
+        data["observation", name] = value.expand(2, 1, 5)
+    actor = LeRobotActor(made, prior, names=NAMES | more, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(actor(data)["vla_action", "chunk"], expected)
+
+
 def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(policy):
     made, prior = policy("multi_task_dit"), PastPrior(LENGTH - 1, sigma=0.0)
     actor = actor_of(made, prior)

@@ -116,8 +116,12 @@ class LeRobotFlow(TensorDictModuleBase):
                     f"{name} has {count} of {steps} observations: append ObservationStack({steps})"
                 )
             value = value[:, -1] if steps == 1 else value[:, -steps:]
-            # In the precision that LeRobot's own loops give: robots and simulators also have float64.
-            inputs[name] = value / 255.0 if value.dtype == torch.uint8 else value.float()
+            if value.dtype == torch.uint8:
+                value = value / 255.0
+            elif value.is_floating_point() or name in self.policy.config.input_features:
+                # In the precision that LeRobot's own loops give: robots and simulators also have float64.
+                value = value.float()
+            inputs[name] = value  # others, such as tokens, stay whole numbers
         return inputs if self.preprocess is None else self.preprocess(inputs)
 
 
