@@ -50,7 +50,7 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
 class DrawnDial(Dial):
     """It draws pictures as bright as the steps that it took, always into the same memory."""
 
-    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 2.5}
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": np.float32(2.5)}
 
     def __init__(self, render_mode=None):
         super().__init__()

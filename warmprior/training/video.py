@@ -40,7 +40,7 @@ def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: float) -
 
     def write(temporary: Path) -> None:
         with av.open(str(temporary), "w", format="mp4") as container:
-            stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(1000))
+            stream = container.add_stream("h264", rate=Fraction(float(rate)).limit_denominator(1000))
             stream.width = stream.height = size
             stream.pix_fmt = "yuv420p"
             for picture in pictures:
