@@ -449,11 +449,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         self.image_size = index.image_size
         #: The number of demos read.
         self.num_episodes = len(index.demos)
-        super().__init__(
-            storage=TensorStorage(data),
-            writer=ImmutableDatasetWriter(),
-            **kwargs,
-        )
+        super().__init__(storage=TensorStorage(data), writer=ImmutableDatasetWriter(), **kwargs)
 
     def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
         """Open the demonstrations at a place, until the stack ends."""

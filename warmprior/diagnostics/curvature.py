@@ -78,8 +78,7 @@ def branching_cost(
     path = getattr(policy.network, "interpolant", LinearInterpolant())
     generator = policy.sampler.chosen_generator(generator)
     with evaluation_mode(policy):
-        source = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key])
-        a0 = source.sample(generator)
+        a0 = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key]).sample(generator)
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
@@ -233,8 +232,7 @@ def curvature(
     with evaluation_mode(policy):
         # All sources are drawn at once, so that splitting the batch does not change them.
         generator = policy.sampler.chosen_generator(generator)
-        source = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key])
-        a0 = source.sample(generator)
+        a0 = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key]).sample(generator)
         for i in range(0, len(rows), SPLIT):
             s = slice(i, i + SPLIT)
             parts.append(_measure(policy, a0[s], rows[policy.observation_key][s], n_steps))

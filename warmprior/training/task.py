@@ -251,10 +251,8 @@ class Task:
             facts: dict[str, Any] = opened.facts | {"source": "file", "file": demonstrations.name}
             if environment is None:
                 return replace(opened, facts=facts)
-            environment |= {
-                "observation_keys": list(index.observation_keys),
-                **given(max_episode_steps=horizon),
-            }
+            environment |= {"observation_keys": list(index.observation_keys)}
+            environment |= given(max_episode_steps=horizon)
             description = registered_description(environment)
             # Unknown wrappers raise an error only when it is built, which training does not need.
             recorded: Any = partial(registered_env, environment)

@@ -153,11 +153,7 @@ def train_policy(
         raise TypeError(f"the prior must be an object such as PastPrior(8), got {prior!r}")
     check_device(device)  # before the demonstrations are read
     if isinstance(demonstrations, str | Path):
-        task = Task.open(
-            demonstrations,
-            observation_keys=observation_keys,
-            image_keys=image_keys,
-        )
+        task = Task.open(demonstrations, observation_keys=observation_keys, image_keys=image_keys)
     elif observation_keys is not None or image_keys:
         raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
     elif isinstance(demonstrations, Task):
