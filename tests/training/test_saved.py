@@ -25,7 +25,7 @@ from warmprior import (
     keys,
 )
 from warmprior.training.checkpoint import load_state, save_state
-from warmprior.training.saved import load_policy, policy_config, save_policy
+from warmprior.training.saved import FORMAT, load_policy, policy_config, save_policy
 
 H, D_A, D_O, TO = 3, 2, 5, 2
 ACTION = "normalizer.action_scale"
@@ -225,10 +225,10 @@ def test_a_copy_of_the_configuration_that_differs_is_reported(tmp_path):
 def test_files_that_are_none(tmp_path):
     with raises(FileNotFoundError, "nowhere", "model.safetensors"):
         load_policy(tmp_path / "nowhere")
-    for version in (5, None, "7"):
+    for version in (FORMAT - 1, None, str(FORMAT)):
         saved(tmp_path)
         rewrite(tmp_path, lambda tensors, config, version=version: config.update(format=version))
-        with raises(ValueError, "format", 7):
+        with raises(ValueError, "format", FORMAT):
             load_policy(tmp_path)
     (tmp_path / "model.safetensors").unlink()
     os.mkfifo(tmp_path / "model.safetensors")

@@ -30,7 +30,7 @@ from warmprior.modules.registry import from_config
 from warmprior.modules.trend import RestingAction
 from warmprior.training.checkpoint import as_key, load_state, save_state
 
-FORMAT = 7
+FORMAT = 8
 """The version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
