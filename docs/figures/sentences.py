@@ -147,7 +147,7 @@ def sentences() -> dict[str, list[str]]:
             f"{span(short)} points less often at one step after 10,000 iterations",
             f"it solves {spaced(long[0])}% at nine, three",
             f"the Gaussian source {spaced(long[1])} ({in_words(long[2].split(', ')[0])} at nine)",
-            f"{spaced(better[0])} and {spaced(better[1])} (table)",
+            f"{spaced(better[0])} and {spaced(better[1])}, within chance",
         ],
         "which_source.md": [
             f"{span(joints)}% at three steps",
@@ -159,7 +159,7 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Past and WP-Preview succeed {span(few)} points more often",
             f"the Gaussian source solves {whole(pusht[206][GAUSSIAN])}% at nine steps, "
             f"and warm sources {span([pusht[206][s] for s in WARM])}%",
-            f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (one seed)",
+            f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (two seeds)",
             f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
             f"solves {whole(mip['Push-T, 206'])}% with 206",
             f"at one step {can[GAUSSIAN]}%, and {can[PAST]} (two seeds)",
