@@ -396,12 +396,11 @@ class Task:
                     raise ValueError(f"its {key!r} is {found}, but that of the demonstrations {expected}")
             env.set_seed(0)
             env.step(env.reset().set(CHUNK, self.data[ACTION][:1].to("cpu")))
-        except ImportError:
-            raise
         except Exception as error:  # the simulator or the user's code can raise anything
             reason = error.args[0] if isinstance(error, KeyError) and error.args else error
             file = f" ({self.facts['file']})" if "file" in self.facts else ""
-            raise ValueError(
+            kind = ImportError if isinstance(error, ImportError) else ValueError
+            raise kind(
                 f"the environment of {self.name} {self.style}{file} cannot be played: {reason}"
             ) from error
         finally:
