@@ -146,8 +146,8 @@ class PriorSpaceAgent:
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=config.box(actor))
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
-        around_zero: Any = {} if has_anchor(actor) else {"distribution": "clipped"}
-        self.warmup = TensorDictSequential(ResidualSampler(self.decoder, **around_zero), self.decoder)
+        drawn: Literal["clipped"] | None = None if has_anchor(actor) else "clipped"
+        self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
         names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
         sizes: dict[str, Any] = {name: getattr(actor.network, name, None) for name in names}
