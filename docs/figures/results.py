@@ -115,7 +115,8 @@ def steps() -> None:
 
 def iterations() -> None:
     """Draw chart C: success against the length of the training."""
-    picture, axes = figure(WIDTH, 12.4, 2, "Success against the length of the training", rows=4)
+    rows = (len(LENGTHS) + 1) // 2
+    picture, axes = figure(WIDTH, 3.1 * rows, 2, "Success against the length of the training", rows=rows)
     for spare in axes[len(LENGTHS) :]:
         spare.remove()
     for axis, (name, runs) in zip(axes, LENGTHS.items(), strict=False):

@@ -11,7 +11,18 @@ import numpy as np
 from leaderboard import SCRIPTED, pairs, standings, trials
 from pages import own_best
 from pandas import DataFrame
-from results import CHOICES, GROUPS, LONG, SHORT, TEN, TWENTY_FIVE, WARM, all_lengths
+from results import (
+    CHOICES,
+    GROUPS,
+    LENGTHS,
+    LONG,
+    SHORT,
+    TEN,
+    TWENTY_FIVE,
+    WARM,
+    all_lengths,
+    outcomes_by_length,
+)
 from shared import CORRELATED, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
 
 
@@ -37,10 +48,10 @@ def solved(run: str, source: str, nfe: int, noise: float = 1.0) -> float:
     return 100 * np.concatenate(list(played(run, source, nfe, noise)["solved"])).mean()
 
 
-def two_seeds_of(run: str, source: str) -> float:
-    """Return the success of the first two seeds at three steps in percent."""
-    rows = played(run, source, 3)
-    return 100 * rows[rows["seed"] < 2]["success_rate"].mean()
+def falls(demonstrations: str, nfe: int) -> dict[str, str]:
+    """Return the success of the Gaussian source and WP-Past after short and long training, as ``a to b``."""
+    outcomes = outcomes_by_length(LENGTHS[demonstrations], PAST, nfe)
+    return {s: " to ".join(str(whole(100 * solved.mean())) for solved in of) for s, of in outcomes.items()}
 
 
 def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
@@ -102,17 +113,7 @@ def sentences() -> dict[str, list[str]]:
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     mip = board.loc["mip", 2]
     joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
-    fall = {
-        s: f"{whole(two_seeds_of('door_20000', s))} to {whole(two_seeds_of('door_80000', s))}"
-        for s in (GAUSSIAN, PAST)
-    }
-    can = {
-        s: " to ".join(
-            str(whole(np.mean([solved(f"can_mh_25_{length}{seed}", s, 1) for seed in ("", "_second")])))
-            for length in (10000, 80000)
-        )
-        for s in (GAUSSIAN, PAST)
-    }
+    fall, can = falls("door, 25 human", 3), falls("can, 25 of six operators", 1)
     best_mean = {s: whole(board.loc[s, 9]["best noise"]) for s in (GAUSSIAN, PAST)}
     (won, lost), mip_pair, mip_beside_past, past_once = (
         frame.loc[setting]
