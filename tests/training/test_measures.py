@@ -113,9 +113,13 @@ def test_chunks_inside_of_numbered_workers_are_looked_at_too():
         evaluate(POLICY, env, episodes=2, first_seed=0, success="won")
 
 
-def test_a_reward_may_be_summed():
+@pytest.mark.parametrize("told", [{}, {"measures": {"reward": "sum"}}])
+def test_a_reward_may_be_summed(told):
     measures = {"reward": "sum"}  # the toy pays t at step t
-    for episode in evaluate(POLICY, make_env(), episodes=3, first_seed=0, success="won", measures=measures):
+    env = TransformedEnv(
+        Saying(), policy_transforms(PastPrior(H), observation_steps=1, success="won", **told)
+    )
+    for episode in evaluate(POLICY, env, episodes=3, first_seed=0, success="won", measures=measures):
         assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))
 
 

@@ -323,8 +323,8 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
             for key in asked.keys() & below - {keys.EXECUTED}:
                 if (has := combined.get(key, "last")) != (how := asked[key]):
                     raise ValueError(
-                        f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: "
-                        "give policy_transforms the same success and measures, and gamma=1"
+                        f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: ask for "
+                        "what it keeps, or give policy_transforms the same success and measures, and gamma=1"
                     )
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):

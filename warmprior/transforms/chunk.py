@@ -258,11 +258,13 @@ class ChunkStep(EnvTransform):
                     "ChunkStep needs one reward and a root 'done', the environment has "
                     f"rewards {rewards} and done keys {dones}"
                 )
-            taken = {rewards[0], *parent.state_spec.keys(True, True)}
-            if names := [key for key in self.measures if unravel_key(key) in taken]:
+            kept = dict.fromkeys(parent.state_spec.keys(True, True))
+            kept[rewards[0]] = "sum" if self.gamma == 1 else None
+            if names := [k for k, how in self.measures.items() if kept.get(unravel_key(k), how) != how]:
                 raise ValueError(
                     f"measures of ChunkStep cannot include {names}, a chunk's return or what the next step "
-                    "reads: have the environment write it under another key as well"
+                    "reads: ask for a reward's 'sum' (with gamma=1) and a state's 'last', or have the "
+                    "environment write it under another key as well"
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
@@ -352,13 +354,14 @@ class ChunkStep(EnvTransform):
             return [v if rows is None else torch.where(expand_as_right(rows, v), v, 0) for v, rows in pairs]
 
         # Combined before they are written, because the result of the last step is written into.
-        whole = {reward_key: self._return(terms(reward_key))}
+        whole: dict[NestedKey, Tensor] = {}
         flagged = next_tensordict.get(self.success, None) is not None
         for key, how in ({self.success: "max", **self.measures} if flagged else self.measures).items():
             if how == "sum":
                 whole[key] = torch.stack(terms(key)).sum(0)
             else:
                 whole[key] = torch.stack([result.get(key) for result in results]).amax(0)
+        whole[reward_key] = self._return(terms(reward_key))
         masks = [rows for rows in ran if rows is not None]
         steps = torch.full(batch, len(ran) - len(masks), dtype=torch.int64, device=next_tensordict.device)
         whole[keys.EXECUTED] = sum(masks, steps).unsqueeze(-1)
