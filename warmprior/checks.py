@@ -62,6 +62,17 @@ def check_between(low: float, high: float, /, **values: Any) -> None:
     _check_range(values, lambda value: low <= value <= high, f"between {low} and {high}")
 
 
+def is_true(key: NestedKey, value: Any) -> bool:
+    """Return a flag that says whether a task is solved; raise ValueError for a number but 0 and 1."""
+    number = torch.as_tensor(value).item()
+    if number not in (0, 1):
+        raise ValueError(
+            f"success is read from {key!r}, which is {number:g} and neither True (1) nor False (0): have the "
+            "environment write a flag, and name this number in measures"
+        )
+    return bool(number)
+
+
 def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
     """Raise ValueError if a value is none of the choices."""
     if value not in (listed := list(choices)):

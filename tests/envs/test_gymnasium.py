@@ -97,6 +97,12 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
         gym_env(both, success="solved")
 
 
+def test_a_fraction_is_no_success():
+    env = gym_env(Dial(), success="height")
+    with raises(ValueError, "'height'", "measures"):
+        env.rollout(5)
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_observations_are_float32_and_stay_as_they_were_seen(dtype):
     class OneBuffer(Dial):

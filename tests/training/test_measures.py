@@ -113,6 +113,12 @@ def test_chunks_inside_of_numbered_workers_are_looked_at_too():
         evaluate(POLICY, env, episodes=2, first_seed=0, success="won")
 
 
+def test_a_fraction_is_no_success():
+    for env in (make_env(execute=1), make_env(SerialEnv(2, Saying), execute=1)):
+        with raises(ValueError, "'high'", "measures"):
+            evaluate(POLICY, env, episodes=2, first_seed=0, success="high")
+
+
 @pytest.mark.parametrize("told", [{}, {"measures": {"reward": "sum"}}])
 def test_a_reward_may_be_summed(told):
     measures = {"reward": "sum"}  # the toy pays t at step t

@@ -24,6 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from warmprior.checks import is_true
 from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
@@ -40,8 +41,10 @@ class _Infos(BaseInfoDictReader):
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         for key, dtype in self._dtypes.items():
-            value = torch.as_tensor(info_dict.get(key, 0), dtype=dtype)
-            tensordict.set(key, value.reshape(1))
+            value = info_dict.get(key, 0)
+            if dtype == torch.bool:
+                value = is_true(key, value)
+            tensordict.set(key, torch.as_tensor(value, dtype=dtype).reshape(1))
         return tensordict
 
 
@@ -92,8 +95,8 @@ def gym_env(
 
     Raises:
         KeyError: if an entry does not exist.
-        ValueError: if an observation is not a vector, such as a discrete one, or entries of ``info`` are
-            asked of a vector environment.
+        ValueError: if an observation is not a vector, such as a discrete one, entries of ``info`` are
+            asked of a vector environment, or (at a step) success is a fraction.
 
     Examples:
         >>> import gymnasium

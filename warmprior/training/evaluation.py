@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_whole_numbers, is_true
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
@@ -76,7 +76,7 @@ class _Tally:
     def add(self, after: TensorDictBase, decision: TensorDictBase) -> None:
         """Add a decision and the environment's output after it."""
         self._decisions.append(decision)
-        self._solved |= bool(after[self._success_key])
+        self._solved |= is_true(self._success_key, after[self._success_key])
         self._steps += int(after[keys.EXECUTED])
         for key, how in self._how.items():
             value = float(after[key])
