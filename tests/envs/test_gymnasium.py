@@ -97,6 +97,23 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
         gym_env(both, success="solved")
 
 
+@pytest.mark.parametrize("name", ["turns", "dial", "observation", "reward", "terminated"])
+def test_info_replaces_nothing_else_that_a_step_returns(name):
+    with raises(ValueError, f"['{name}'] of info"):
+        gym_env(Dial(nested=True), success=name)
+    with raises(ValueError, f"['{name}'] of info"):
+        gym_env(Dial(nested=True), success="solved", measures=["height", name])
+
+    class Telling(Dial):
+        def step(self, action):
+            *returned, _ = super().step(action)
+            return *returned, {name: np.zeros(1)}
+
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    with raises(ValueError, f"['{name}'] of info"):
+        gym_env(gymnasium.vector.SyncVectorEnv([lambda: Telling(nested=True)], autoreset_mode=mode))
+
+
 def test_a_fraction_is_no_success():
     env = gym_env(Dial(), success="height")
     with raises(ValueError, "'height'", "measures"):

@@ -66,6 +66,17 @@ class _Gym(GymWrapper):
         # An environment may write all its observations into one buffer.
         return super().read_obs(copy.deepcopy(observations))
 
+    def set_info_dict_reader(self, info_dict_reader: Any = None, **options: Any) -> Any:
+        # A reader writes over what a step returned, without a word.
+        returned = {OBSERVATION, *self.observation_spec.keys(), *self.reward_keys, *self.done_keys}
+        super().set_info_dict_reader(info_dict_reader, **options)
+        if hidden := sorted(returned & set(self.info_dict_reader[-1].info_spec.keys())):
+            raise ValueError(
+                f"the entries {hidden} of info would replace the environment's own: rename them in info, or "
+                "leave them out of success and measures"
+            )
+        return self
+
     def _set_seed(self, seed: int | None) -> None:
         self._next = seed
 
@@ -95,8 +106,8 @@ def gym_env(
 
     Raises:
         KeyError: if an entry does not exist.
-        ValueError: if an observation is not a vector, such as a discrete one, entries of ``info`` are
-            asked of a vector environment, or (at a step) success is a fraction.
+        ValueError: if an observation is not a vector, such as a discrete one, entries of ``info`` would
+            replace others or are asked of a vector environment, or (at a step) success is a fraction.
 
     Examples:
         >>> import gymnasium
