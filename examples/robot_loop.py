@@ -25,7 +25,9 @@ import torch
 from tensordict import TensorDict
 
 from warmprior import PastPrior, WarmPriorActor
+from warmprior.checks import check_not_negative, check_positive
 from warmprior.deploy import AsyncExecutor
+from warmprior.io.script import ERRORS, run_script
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 PATIENCE = 1.0
@@ -225,7 +227,7 @@ def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train the policy, run the loop, and report the timing of its steps."""
+    """Play with the options of the command line, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     add = parser.add_argument
     add("--rate", type=float, default=50.0, help="control steps per second (default: %(default)s)")
@@ -235,18 +237,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--unplug", type=float, default=math.inf, help="seconds until the robot stops answering")
     add("--iterations", type=int, default=300, help="iterations of the training (default: %(default)s)")
     options = parser.parse_args(argv)
-    torch.set_num_threads(1)  # leave a core to the loop
+    # It reports errors in one line, and leaves a core to the loop.
+    return run_script(lambda: play(options), "robot_loop.py", errors=(*ERRORS, RuntimeError))
+
+
+def play(options: argparse.Namespace) -> None:
+    """Train the policy, run the loop, and report the timing of its steps."""
+    check_positive(**{"--rate": options.rate})
+    check_not_negative(**{"--decision": options.decision})
     policy = trained(options.camera, options.rate, options.iterations)  # yours: load_policy("policies/...")
     policy.register_forward_pre_hook(lambda module, inputs: time.sleep(options.decision))
     robot = SimulatedArm(options.camera, options.unplug)
-    try:
-        record = run(robot, policy, options.rate, options.seconds)
-    except RuntimeError as error:
-        print(error, file=sys.stderr)
-        return 1
+    record = run(robot, policy, options.rate, options.seconds)
     print(f"NFE {NFE}, {CHUNK} actions per chunk, {'camera' if options.camera else 'no camera'}")
     print(record.report(1 / options.rate))
-    return 0
 
 
 if __name__ == "__main__":

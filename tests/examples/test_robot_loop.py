@@ -184,10 +184,19 @@ def test_the_program_runs_in_real_time():
     assert re.search(r"p50 [\d.]+, p95 [\d.]+, max [\d.]+ ms\n\d+ steps, \d+ late, \d+ held", done.stdout)
 
 
-def test_the_program_says_why_it_stopped():
-    done = program("--unplug", "0.3")
-    assert done.returncode == 1
-    assert done.stderr.strip().count("\n") == 0 and "has not answered" in done.stderr
+@pytest.mark.parametrize(
+    ("options", "fact"),
+    [
+        (["--unplug", "0.3"], "has not answered"),
+        (["--unplug", "0"], "has not answered"),
+        (["--rate", "100"], "lower the control rate"),
+        (["--rate", "0"], "--rate must be > 0"),
+    ],
+)
+def test_the_program_says_why_it_stopped(options, fact):
+    done = program(*options)
+    assert done.returncode == 2
+    assert done.stderr.strip().count("\n") == 0 and fact in done.stderr
 
 
 def test_it_has_the_options_that_its_page_names(example, capsys):

@@ -20,7 +20,7 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
     if length is not None and 2 * delay > length:
         raise ValueError(
             f"a delay of {delay} control steps is too long for predictions of {length} actions: at most "
-            f"{length // 2}. Predict longer chunks, or make the policy faster"
+            f"{length // 2}. Predict longer chunks, make the policy faster, or lower the control rate"
         )
     if delay > execute:
         raise ValueError(
