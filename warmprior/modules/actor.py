@@ -20,7 +20,7 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor
 from warmprior.modules.prior import Prior, Source, noise_factor
 from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.modules.registry import Registered
+from warmprior.modules.registry import Registered, kept_arguments
 
 
 class StartPoint(Registered, nn.Module):
@@ -281,6 +281,8 @@ class WarmPriorActor(TensorDictModuleBase):
     def replace(self, **changes: Any) -> WarmPriorActor:
         """Return a copy of the policy that shares its parts, with some constructor arguments changed.
 
+        A subclass keeps its constructor's further arguments in attributes of the same names.
+
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
             >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
@@ -300,4 +302,4 @@ class WarmPriorActor(TensorDictModuleBase):
             **self.tensor_keys,
             **asdict(self.sampling),
         }
-        return type(self)(**arguments | changes)
+        return type(self)(**arguments | kept_arguments(self, known=arguments) | changes)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, ClassVar
 
-__all__ = ["Registered", "from_config"]
+__all__ = ["Registered", "from_config", "kept_arguments"]
 
 
 class Registered:
@@ -53,34 +53,12 @@ class Registered:
                 raise ValueError(f"{name!r} is the name of {taken}: choose another for {cls}")
             cls.classes[name] = cls
 
-    def arguments(self) -> dict[str, Any]:
-        """Return the constructor's arguments, read from the attributes of the same names.
-
-        Raises TypeError if the object does not keep an argument.
-        """
-        values: dict[str, Any] = {}
-        for cls in type(self).__mro__:
-            if "__init__" not in vars(cls):
-                continue
-            parameters = list(inspect.signature(vars(cls)["__init__"]).parameters.values())[1:]
-            passed_on = [p for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-            for parameter in (p for p in parameters if p not in passed_on):
-                if parameter.name == "name" or not _keeps(self, parameter.name):
-                    raise TypeError(
-                        f"{type(self).__name__} cannot be saved: its constructor must keep the argument "
-                        f"{parameter.name!r} as an attribute of this name (and call none 'name')"
-                    )
-                values.setdefault(parameter.name, getattr(self, parameter.name))
-            if not passed_on:
-                break
-        return values
-
     def config(self) -> dict[str, Any]:
         """Return name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
         An argument with a ``config()`` is saved as that. Raises TypeError if JSON cannot hold an argument.
         """
-        values = {n: v.config() if hasattr(v, "config") else v for n, v in self.arguments().items()}
+        values = {n: v.config() if hasattr(v, "config") else v for n, v in kept_arguments(self).items()}
         try:
             return json.loads(json.dumps({"name": self.name, **values}, allow_nan=False))
         except (TypeError, ValueError) as error:
@@ -91,10 +69,33 @@ class Registered:
 
     def __repr__(self) -> str:
         try:
-            written = ", ".join(f"{name}={value!r}" for name, value in self.arguments().items())
+            written = ", ".join(f"{name}={value!r}" for name, value in kept_arguments(self).items())
         except TypeError:
             written = "..."
         return f"{type(self).__name__}({written})"
+
+
+def kept_arguments(part: object, known: Container[str] = ()) -> dict[str, Any]:
+    """Return the constructor's arguments but the known ones, read from the attributes of the same names.
+
+    Raises TypeError if the object does not keep an argument.
+    """
+    values: dict[str, Any] = {}
+    for cls in type(part).__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        parameters = list(inspect.signature(vars(cls)["__init__"]).parameters.values())[1:]
+        passed_on = [p for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+        for name in (p.name for p in parameters if p not in passed_on and p.name not in known):
+            if (name == "name" and isinstance(part, Registered)) or not _keeps(part, name):
+                raise TypeError(
+                    f"{type(part).__name__} cannot be saved or copied: its constructor must keep the "
+                    f"argument {name!r} as an attribute of this name (and a part's must call none 'name')"
+                )
+            values.setdefault(name, getattr(part, name))
+        if not passed_on:
+            break
+    return values
 
 
 def _keeps(part: object, name: str) -> bool:
