@@ -245,6 +245,11 @@ def test_training_reaches_a_known_optimum():
     assert float((found - best).abs().mean()) < 0.12 < 0.22 < float(best.abs().mean())
 
 
+def test_losses_are_0_if_no_row_has_weight():
+    out = build()(batch().set("priority_weight", torch.zeros(N)))
+    assert all(value == 0 for name, value in out.items() if name.startswith("loss_"))
+
+
 def test_schedule():
     loss = build(noise_critic_steps=3)
     names = [compute.__name__ for compute in loss.schedule(updates=2)]

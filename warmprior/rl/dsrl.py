@@ -337,6 +337,8 @@ class DSRLNALoss(LossModule):
     def _finish(
         self, losses: dict[str, Tensor], tensordict: TensorDictBase, weights: Tensor | None
     ) -> TensorDict:
+        if weights is not None and not weights.any():  # no row counts, and TorchRL would divide by 0
+            losses, weights = {name: 0 * loss for name, loss in losses.items()}, None
         options: Any = {"tensordict": tensordict, "weights": weights}
         reduced = {name: self._reduce_loss(loss, **options) for name, loss in losses.items()}
         check_finite(reduced)
