@@ -8,6 +8,8 @@ import h5py
 import pytest
 import torch
 from tensordict import NonTensorStack, TensorDict
+from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
@@ -218,6 +220,17 @@ def test_data_that_cannot_be_are_named():
         task = Task.of("own", steps(**fitting | changed), NavigationEnv)
         with raises(ValueError, "own human", f"'{next(iter(changed))}'"):
             task.check_environment()
+
+
+def test_an_environment_with_transforms_of_its_own_takes_random_chunks():
+    task = Task.of(
+        "own",
+        steps(observation=torch.randn(40, 9), action=torch.rand(40, 1)),
+        lambda: TransformedEnv(NavigationEnv(), StepCounter()),
+    )
+    env = task.env(GaussianPrior(4))
+    check_env_specs(env)
+    assert env.rollout(2)["next", "step_count"].flatten().tolist() == [4, 8]
 
 
 def test_an_environment_with_images_fits_its_demonstrations():

@@ -18,7 +18,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import uncompiled
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
-from warmprior.transforms.policy import policy_transforms
+from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 _IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
 
@@ -133,7 +133,7 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         ValueError: the policy keeps no description of an environment of robosuite or Gymnasium: ...
     """
     make_env, make_transforms = environment_parts(actor)
-    return TransformedEnv(make_env(**options), make_transforms(), auto_unwrap=False)
+    return PolicyEnv(make_env(**options), make_transforms())
 
 
 def environment_name(actor: WarmPriorActor) -> str | None:

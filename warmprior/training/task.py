@@ -24,7 +24,7 @@ from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
-from warmprior.transforms.policy import policy_transforms
+from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 NEAR = 0.2
 """The largest distance of actions from the observed joints they set, as a share of the actions' variance."""
@@ -368,8 +368,7 @@ class Task:
             success=self.success,
             measures=self.measures,
         )
-        # auto_unwrap=False, because the environment's own transforms must stay inside.
-        return TransformedEnv(base or self.make_env(**options), transforms, auto_unwrap=False)
+        return PolicyEnv(base or self.make_env(**options), transforms)
 
     def check_environment(self, **options: Any) -> None:
         """Build the environment, reset it and step once with a recorded action, without training.

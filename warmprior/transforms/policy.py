@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
@@ -17,6 +19,14 @@ from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, check_delay
 from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
+
+
+class PolicyEnv(TransformedEnv):
+    """An environment with a policy's transforms; its own stay inside, as TorchRL unwraps no subclass."""
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Draw a chunk, which TorchRL refuses to do around an environment with transforms of its own."""
+        return EnvBase.rand_action(self, tensordict)
 
 
 def policy_transforms(
