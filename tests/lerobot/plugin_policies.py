@@ -69,6 +69,7 @@ def saved_flow_policy(found, folder, image=None):
     kind, named = found["warm_flow"], features(image)
     named["output_features"]["action"].shape = (2,)
     small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
+    small |= {"n_action_steps": 5, "prior_chunk": 8}  # fewer are executed than remembered
     config = kind.config_class(precondition=False, image_size=32, crop_size=28, **small, **named)
     torch.manual_seed(0)
     policy = kind(config)

@@ -53,6 +53,14 @@ def training_episodes(meta: Any) -> list[int] | None:
     return None if dataset is None else dataset.episodes
 
 
+class WarmFlowActor(WarmPriorActor):
+    """The actor of :class:`WarmFlowPolicy`; ``execute`` is the number of actions per decision."""
+
+    def __init__(self, network: nn.Module, prior: Prior, *, execute: int, **options: Any) -> None:
+        super().__init__(network, prior, **options)
+        self.execute = execute
+
+
 class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
 
@@ -133,7 +141,13 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
         # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
-        self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
+        self.actor = WarmFlowActor(
+            network,
+            prior,
+            execute=config.n_action_steps,
+            nfe=config.nfe,
+            clip=1.0 if spans else None,
+        )
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
         # A saved policy's moments are those of other data with another normalisation.

@@ -24,8 +24,7 @@ def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> War
 
     It includes the processors that LeRobot saved with it. Cameras have the last part of LeRobot's names:
     ``"front"`` for ``observation.images.front``. The ``"state"`` of a ``warm_flow`` policy is the
-    concatenation of its vectors, ``observation.environment_state`` before ``observation.state``; if its
-    ``n_action_steps`` is below ``prior_chunk``, give it to the executor as ``execute``.
+    concatenation of its vectors, ``observation.environment_state`` before ``observation.state``.
 
     Args:
         place: a folder, such as ``run/checkpoints/last/pretrained_model``, or a repository of the hub.
