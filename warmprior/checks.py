@@ -79,6 +79,12 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(listed)}, got {value!r}")
 
 
+def check_distinct(what: str, names: Sequence[str]) -> None:
+    """Raise ValueError if there is no name, or one occurs twice."""
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{what} must be different names, got {list(names)}")
+
+
 def check_device(device: torch.device | str) -> None:
     """Raise ValueError if a device, such as ``"cuda"``, is unknown or does not work."""
     try:

@@ -90,6 +90,8 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
     assert SerialEnv(2, lambda: env).rollout(2)["observation"][1, 1].tolist() == [200.0, 1.0, 0.0]
     with raises(ValueError, "'choice'", "FlattenObservation"):
         gym_env(Signs())
+    with raises(ValueError, "observation_keys", "['grey', 'grey']"):
+        gym_env(Signs(), observation_keys=["grey", "grey"])
     mode = gymnasium.vector.AutoresetMode.SAME_STEP
     both = gymnasium.vector.SyncVectorEnv([lambda: Dial(nested=True)] * 2, autoreset_mode=mode)
     assert gym_env(both).reset()["observation"].shape == (2, 3)  # without what info tells

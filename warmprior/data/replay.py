@@ -22,7 +22,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
-from warmprior.checks import check_choice, check_whole_numbers
+from warmprior.checks import check_choice, check_distinct, check_whole_numbers
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import declared_actions, delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
@@ -84,6 +84,7 @@ class DatasetIndex:
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observation_keys: {listed}")
+        check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from warmprior.checks import is_true
+from warmprior.checks import check_distinct, is_true
 from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
@@ -122,6 +122,7 @@ def gym_env(
     seen = [key for key in base.observation_spec.keys(True, True) if key not in in_info]
     present = {key if isinstance(key, str) else "/".join(key): key for key in seen}
     chosen = list(observation_keys) or list(present)
+    check_distinct("observation_keys", chosen)
     if missing := [key for key in chosen if key not in present]:
         raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
     dtypes = {success: torch.bool} if success is not None else {}

@@ -17,6 +17,7 @@ from warmprior import keys
 from warmprior.checks import (
     check_between,
     check_choice,
+    check_distinct,
     check_keys,
     check_shape,
     check_whole_numbers,
@@ -96,8 +97,7 @@ class ImageEncoder(nn.Module):
     ) -> None:
         super().__init__()
         cameras = tuple(cameras)
-        if not cameras or len(set(cameras)) < len(cameras):
-            raise ValueError(f"an image encoder needs different cameras, got {list(cameras)}")
+        check_distinct("cameras of an image encoder", cameras)
         check_whole_numbers(0, state_dim=state_dim)
         check_between(8, image_size, crop_size=crop_size)
         check_choice("backbone", backbone, get_args(Backbone))

@@ -13,7 +13,7 @@ from tensordict.utils import unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 
 from warmprior import keys
-from warmprior.checks import check_keys, check_whole_numbers
+from warmprior.checks import check_distinct, check_keys, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation
 from warmprior.transforms.inner_step import EnvTransform
@@ -49,14 +49,13 @@ class CameraImages(EnvTransform):
         >>> CameraImages(["agentview", "agentview"])
         Traceback (most recent call last):
             ...
-        ValueError: CameraImages needs different cameras, got ['agentview', 'agentview']
+        ValueError: cameras of CameraImages must be different names, got ['agentview', 'agentview']
     """
 
     def __init__(self, cameras: Sequence[str], size: int = 84) -> None:
         super().__init__(in_keys=[keys.OBSERVATION, keys.SIM_STATE], out_keys=[keys.OBSERVATION])
         self.cameras = tuple(cameras)
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise ValueError(f"CameraImages needs different cameras, got {list(self.cameras)}")
+        check_distinct("cameras of CameraImages", self.cameras)
         check_whole_numbers(size=size)
         self.size = size
 
