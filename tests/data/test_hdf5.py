@@ -42,6 +42,8 @@ def test_an_unknown_environment_has_what_it_finds(tmp_path):
         for demo in file["data"].values():
             steps = len(demo["actions"])
             del demo["obs/robot1_eef_quat"]
+            demo["obs/robot2_eef_pos"] = demo["obs/robot3_right_eef_pos"] = np.full((steps, 3), 0.5)
+            demo["obs/robot2_joint_pos"] = np.zeros((steps, 7))
             demo["obs/robot_goal"] = np.full((steps, 2), 0.25)
             demo["obs/door_open"] = np.zeros(steps, bool)
             demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
@@ -51,12 +53,15 @@ def test_an_unknown_environment_has_what_it_finds(tmp_path):
     assert index.task is None and index.action_dim == 14
     assert index.observation_keys == (
         *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
-        *("robot1_eef_pos", "robot1_gripper_qpos", "door_open", "robot_goal"),
+        *("robot1_eef_pos", "robot1_gripper_qpos", "robot2_eef_pos"),
+        *("door_open", "robot3_right_eef_pos", "robot_goal"),
     )
     assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
     for nothing in [], ():
         with raises(DatasetError, "file.hdf5", "observation_keys", "robot0_eef_pos"):
             read_index(path, observation_keys=nothing)
+    with raises(ValueError, "file.hdf5", "['object', 'object']"):
+        read_index(path, observation_keys=["object", "object"])
 
 
 def test_a_file_of_another_simulator_is_read_without_its_environment(tmp_path):

@@ -336,8 +336,10 @@ def read_index(
         elif task is not None:
             keys = task.low_dim_keys
         else:
-            usual = [key for key in low_dim_keys(arms=2) if key in available]
-            others = [k for k in available if k not in usual and not k.startswith(("robot0_", "robot1_"))]
+            usual = [key for key in low_dim_keys(arms=len(available)) if key in available]
+            # Joints and velocities of a robot say again where its gripper is.
+            known = {key.partition("_")[0] for key in usual} - {"object"}
+            others = [k for k in available if k not in usual and k.partition("_")[0] not in known]
             keys = (*usual, *(key for key in others if _is_vector(observations, key)))
         obs_names = [f"obs/{key}" for key in keys]
         if poses:

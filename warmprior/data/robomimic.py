@@ -31,8 +31,8 @@ class RobomimicDemonstrations(DemonstrationReplay):
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: number of demos to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
-            unknown environment the object, every robot's pose and gripper, and all other vectors that are not
-            called ``robot0_...`` or ``robot1_...``.
+            unknown environment the object, every robot's pose and gripper, and all other vectors but
+            those of a robot with such a pose or gripper (``robot0_...``).
         image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; use
             ``storage="memmap"`` for many images.
         absolute_actions: True turns the recorded pose deltas into absolute poses
