@@ -251,6 +251,7 @@ def test_an_environment_with_images_fits_its_demonstrations():
     [
         ({"actions": "absolute", "horizon": 9}, "actions, horizon"),
         ({"fast_rendering": True, "make_env": NavigationEnv}, "fast_rendering"),
+        ({"fast_rendering": True}, "image_keys"),
         ({"success": "solved"}, "make_env"),
     ],
 )

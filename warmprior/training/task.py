@@ -225,6 +225,8 @@ class Task:
         outcome = given(success=success, measures=measures, video_rate=video_rate)
         if outcome and make_env is None:
             raise ValueError(f"{', '.join(outcome)} of an environment of your own: pass its make_env as well")
+        if fast_rendering and not image_keys:
+            raise ValueError("fast_rendering belongs to images: name image_keys, or leave it out")
         demonstrations = files.opened(place, task, mask)
         image_keys = demonstrations.image_keys(image_keys)
         index = demonstrations.index(observation_keys=observation_keys)
