@@ -290,16 +290,6 @@ class WarmPriorActor(TensorDictModuleBase):
             >>> actor.sampling.nfe, one_step.sampling.nfe, one_step.network is actor.network
             (None, 1, True)
         """
-        arguments = {
-            "network": self.network,
-            "prior": self.prior,
-            "start": self.start,
-            "guidance": self.ode.guidance,
-            "normalizer": self.normalizer,
-            "environment": self.environment,
-            "generator": self.sampler.generator,
-            "spec": self.spec,
-            **self.tensor_keys,
-            **asdict(self.sampling),
-        }
+        arguments = {"guidance": self.ode.guidance, "generator": self.sampler.generator}
+        arguments |= self.tensor_keys | asdict(self.sampling)
         return type(self)(**arguments | kept_arguments(self, known=arguments) | changes)
