@@ -32,6 +32,7 @@ from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
+MISFIT = "They do not fit these actions: correct one or the other."
 LARGEST = 1e9  # in any unit; a larger value is damage, and would squash all others of its feature
 
 
@@ -133,7 +134,7 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
 
 def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] | None:
     """Call :func:`~warmprior.envs.env_args.declared_actions`; raise DatasetError if it fails."""
-    with _fitting(path):
+    with reading(f"{path}: env_args", MISFIT):
         return declared_actions(env_args)
 
 
@@ -146,14 +147,6 @@ def reading(what: str, advice: str) -> Iterator[None]:
         raise
     except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
         raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
-
-
-@contextmanager
-def _fitting(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # an unexpected structure can raise anything
-        raise DatasetError(f"{path}: env_args do not fit these actions: {error!r}") from error
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:
@@ -341,7 +334,7 @@ def _conventions(index: DatasetIndex, absolute_actions: bool) -> tuple[Tensor, T
     """Return units and frame of the recorded deltas, if actions are made absolute."""
     if not (index.env_args or absolute_actions):
         return None
-    with _fitting(index.path):
+    with reading(f"{index.path}: env_args", MISFIT):
         solved(torch.zeros(1), index.env_args)
         conventions = delta_conventions(index.env_args) if absolute_actions else None
     if conventions is not None and index.action_dim != (width := 7 * len(conventions[1])):

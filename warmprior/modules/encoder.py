@@ -25,7 +25,7 @@ from warmprior.checks import (
 from warmprior.io.extras import require
 from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.registry import from_config
+from warmprior.modules.registry import from_config, kept_arguments
 
 Backbone = Literal["resnet18", "small"]
 
@@ -116,8 +116,7 @@ class ImageEncoder(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """Return the constructor arguments as JSON holds them."""
-        names = ("cameras", "state_dim", "image_size", "crop_size", "backbone", "share")
-        return as_json({name: getattr(self, name) for name in names})
+        return as_json(kept_arguments(self))
 
     def forward(self, observation: TensorDictBase) -> Tensor:
         """Return the vector followed by the cameras' features in order, ``[*B, To, observation_dim]``.
