@@ -168,9 +168,8 @@ def evaluate(
             low, high = success_posterior(wins, len(played)).interval(0.95)
             steps = sum(episode.steps for episode in played) / len(played)
             print(
-                f"NFE {n}: {wins} of {len(played)} episodes solved ({100 * wins / len(played):.1f}%; "
-                f"95% of the posterior between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control "
-                "steps on average"
+                f"NFE {n}: {wins} of {len(played)} episodes solved ({wins / len(played):.1%}; 95% of the "
+                f"posterior between {low:.1%} and {high:.1%}), {steps:.0f} control steps on average"
             )
     finally:
         env.close()

@@ -10,15 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.errors import raises
 from tests.toy_env import CountingEnv, Halfway, mlp_actor, random_history
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    RealTimeChunking,
-    WarmPriorActor,
-    keys,
-    policy_transforms,
-)
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, keys, policy_transforms
 from warmprior.history import ENTRIES, advance, cold_history
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig
 
@@ -114,19 +106,21 @@ def test_what_is_replaced_and_what_stays():
 
 
 def test_a_subclass_keeps_its_own_arguments():
-    class Capped(WarmPriorActor):
+    made = actor_for(PastPrior(H))
+
+    class Capped(type(made)):
         def __init__(self, network, prior, limit, *, kept=True, **options):
             super().__init__(network, prior, **options)
             if kept:
                 self.limit, self.kept = limit, kept
 
-    actor = Capped(actor_for(PastPrior(H)).network, PastPrior(H), 0.3)
+    actor = Capped(made.network, made.prior, 0.3)
     one = PriorSpaceAgent(actor, PriorSpaceConfig(hidden_dim=8)).decoder
     again = actor.replace(nfe=2)
     assert (one.ode.sampling.nfe, again.limit, again.sampling.nfe) == (1, 0.3, 2)
     assert actor.replace(limit=0.5).limit == 0.5
     with raises(TypeError, "Capped", "'limit'"):
-        Capped(actor.network, PastPrior(H), 0.3, kept=False).replace(nfe=1)
+        Capped(made.network, made.prior, 0.3, kept=False).replace(nfe=1)
 
 
 OWN_KEYS = {f"{part}_key": ("left", part) for part in ("observation", "history", "source", "chunk")}

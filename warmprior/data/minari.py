@@ -85,12 +85,10 @@ def read_minari_index(
         )
     pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
     chosen = tuple(vectors if observation_keys is None else observation_keys)
-    for key in chosen:
-        if key not in vectors:
-            raise unknown(where, "observation", key, vectors)
-    for key in image_keys:
-        if key not in pictures:
-            raise unknown(where, "image", key, pictures)
+    for kind, wanted, present in (("observation", chosen, vectors), ("image", image_keys, pictures)):
+        for key in wanted:
+            if key not in present:
+                raise unknown(where, kind, key, present)
     check_count(where, demos, dataset.total_episodes)
     episodes = [int(i) for i in dataset.episode_indices][:demos]
     with reading(f"{where}: its episodes", _AGAIN):

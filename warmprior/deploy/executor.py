@@ -123,9 +123,8 @@ class AsyncExecutor:
             raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
         if latency is not None and pool is not None:
             raise ValueError("a simulated latency computes in the calling thread: leave out pool")
-        check_whole_numbers(window=window, observation_steps=observation_steps)
+        check_whole_numbers(window=window, observation_steps=observation_steps, **given(execute=execute))
         check_whole_numbers(0, **given(latency=latency))
-        check_whole_numbers(**given(execute=execute))
         check_not_negative(**given(timeout=timeout))
         check_positive(**given(control_rate=control_rate))
         length = prior.prediction_length

@@ -125,8 +125,8 @@ def gym_env(
     check_distinct("observation_keys", chosen)
     if missing := [key for key in chosen if key not in present]:
         raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
-    dtypes = {success: torch.bool} if success is not None else {}
-    dtypes |= dict.fromkeys(measures, torch.float32)
+    dtypes = dict.fromkeys(measures, torch.float32)
+    dtypes |= {} if success is None else {success: torch.bool}
     if dtypes and base.batch_size:
         raise ValueError(
             f"entries of info ({', '.join(dtypes)}) are read from single environments: give torchrl's "
@@ -211,12 +211,8 @@ def registered_env(
     if env.spec.max_episode_steps is None:
         warnings.warn(f"{name} has no time limit: episodes may never end without a horizon", stacklevel=2)
     success = description.get("success")
-    made = gym_env(
-        env,
-        success=success,
-        observation_keys=description.get("observation_keys") or (),
-        terminate_on_success=terminate_on_success and success is not None,
-    )
+    chosen = description.get("observation_keys") or ()
+    made = gym_env(env, success=success, observation_keys=chosen, terminate_on_success=terminate_on_success)
     if success not in (None, SUCCESS):
         made.append_transform(RenameTransform([success], [SUCCESS]))
     return made

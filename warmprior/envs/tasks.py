@@ -93,15 +93,7 @@ TASKS: dict[str, TaskSpec] = {
             41,
             cameras=("shouldercamera0", "shouldercamera1", "robot0_eye_in_hand", "robot1_eye_in_hand"),
         ),
-        TaskSpec(
-            "tool_hang",
-            "ToolHang",
-            1,
-            700,
-            700,
-            44,
-            cameras=("sideview", "robot0_eye_in_hand"),
-        ),
+        TaskSpec("tool_hang", "ToolHang", 1, 700, 700, 44, cameras=("sideview", "robot0_eye_in_hand")),
         *(
             TaskSpec(name, env_name, 1, 400, 400, width)
             for name, env_name, width in (

@@ -57,16 +57,10 @@ class VelocityNetwork(nn.Module, Registered):
         self, action_dim: int, observation_dim: int, prediction_length: int, observation_steps: int
     ) -> None:
         super().__init__()
-        check_whole_numbers(
-            action_dim=action_dim,
-            observation_dim=observation_dim,
-            prediction_length=prediction_length,
-            observation_steps=observation_steps,
-        )
-        self.action_dim = action_dim
-        self.observation_dim = observation_dim
-        self.prediction_length = prediction_length
-        self.observation_steps = observation_steps
+        check_whole_numbers(action_dim=action_dim, observation_dim=observation_dim)
+        check_whole_numbers(prediction_length=prediction_length, observation_steps=observation_steps)
+        self.action_dim, self.observation_dim = action_dim, observation_dim
+        self.prediction_length, self.observation_steps = prediction_length, observation_steps
 
     def check_chunk(self, a: Tensor) -> None:
         """Raise ValueError if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""

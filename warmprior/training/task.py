@@ -273,13 +273,7 @@ class Task:
             fast_rendering=fast_rendering,
             demos=demos,
         )
-        recorded = files.recorded_task(
-            dataset,
-            images,
-            style=style,
-            actions=actions,
-            horizon=horizon,
-        )
+        recorded = files.recorded_task(dataset, images, style=style, actions=actions, horizon=horizon)
         sha256 = demonstrations.digest(observation_keys=observation_keys, image_keys=image_keys, demos=demos)
         # The default is left out.
         space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}

@@ -146,6 +146,5 @@ class EncodeObservation(EnvTransform):
         """Add the features."""
         network = self.network
         shape = (*observation_spec.shape, network.observation_steps, network.observation_dim)
-        device = observation_spec.device
-        observation_spec[self.out_keys[0]] = Unbounded(shape, device=device)
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device)
         return observation_spec

@@ -120,10 +120,8 @@ class ObservationStack(EnvTransform):
                     "number per row: make it a vector before, for instance with UnsqueezeTransform"
                 )
             shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
-            stack = leaf.unsqueeze(time).expand(shape).clone()
-            observation_spec[unravel_key((self.observation_key, key)) if key else self.observation_key] = (
-                stack
-            )
+            name = unravel_key((self.observation_key, key)) if key else self.observation_key
+            observation_spec[name] = leaf.unsqueeze(time).expand(shape).clone()
         return observation_spec
 
 
