@@ -7,7 +7,7 @@ from torch import nn
 from tests.errors import raises
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, finished, run_until, training, weights
-from warmprior import VelocityMLP
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state, save_state
 
@@ -72,10 +72,17 @@ def grown():
     return network
 
 
+class Halved(WarmPriorActor):
+    def forward(self, tensordict):
+        return super().forward(tensordict).apply(lambda value: value / 2)
+
+
 def test_what_cannot_be_saved_is_refused_before_training(tmp_path):
-    for network, error, fact in ((Plain(), TypeError, "Plain"), (grown(), ValueError, "extra")):
-        with raises(error, fact):
-            training(tmp_path / "run", actor=actor_for(network=network))
+    halved = Halved(VelocityMLP(2, 3, 4, hidden_dim=8), PastPrior(4))
+    refused = {"Plain": actor_for(network=Plain()), "extra": actor_for(network=grown()), "Halved": halved}
+    for fact, actor in refused.items():
+        with raises(ValueError if fact == "extra" else TypeError, fact):
+            training(tmp_path / "run", actor=actor)
 
 
 NETWORKS = {

@@ -105,6 +105,11 @@ def check_repository(name: str) -> None:
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     """Return everything except the weights as JSON; raise TypeError if JSON cannot hold a part."""
     network = uncompiled(actor.network)
+    if type(actor) is not WarmPriorActor:  # a plain actor would be loaded
+        raise TypeError(
+            f"cannot save {type(actor).__name__}: only WarmPriorActor itself is saved; put what the subclass "
+            "adds into a prior, start point or network, or save its state_dict()"
+        )
     if not isinstance(network, VelocityNetwork):
         raise TypeError(f"cannot save {type(network).__name__}: only subclasses of VelocityNetwork are saved")
     guidance = actor.ode.guidance
@@ -182,8 +187,8 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
 
     Raises:
         OSError: if the folder cannot be written to.
-        TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed), or JSON
-            cannot hold a part's options.
+        TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed), the
+            policy is of a subclass of :class:`WarmPriorActor`, or JSON cannot hold a part's options.
         ValueError: if the policy could not be loaded again, which is checked before writing.
 
     Examples:
