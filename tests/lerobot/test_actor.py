@@ -85,6 +85,9 @@ def test_rollouts_start_from_the_mean(policy, family, prior):
         assert torch.equal(start, noise)
     if prior.chunk_length == LENGTH:
         assert torch.equal(rollout["prior", "loc"][1], rollout["vla_action", "chunk"][0])
+    whole, selected = actor_of(made, prior), actor_of(made, prior).select_out_keys(("vla_action", "chunk"))
+    one, other = (policy(rollout.select("observation", "history")) for policy in (whole, selected))
+    assert torch.equal(one["vla_action", "chunk"], other["vla_action", "chunk"])
 
 
 def test_several_observations_and_the_lead_of_a_chunk(policy):
@@ -155,6 +158,7 @@ def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     torch.testing.assert_close(chunk, (seen.x[0] - seen.out[0])[..., :ACTION])
     # A function of the source alone, whatever else is in the batch.
     assert torch.equal(decoder(data.clone())["vla_action", "chunk"], chunk)
+    decoder.select_out_keys(("vla_action", "chunk"))
     torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
 
 

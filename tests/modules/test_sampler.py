@@ -39,3 +39,13 @@ def test_the_observation_is_an_input_where_it_is_read(part):
     assert "state" not in unread.in_keys
     actor = WarmPriorActor(VelocityMLP(2, 2, 4, 1), prior, start=start, observation_key="state")
     assert actor.in_keys == ["state", *((keys.HISTORY, name) for name in ENTRIES)]
+
+
+def test_the_usual_observation_is_read_and_outputs_can_be_selected():
+    history = random_history(PastPrior(4), 3, cold=0.0)
+    data = TensorDict({"history": history, "observation": torch.randn(3, 1, 2)}, [3])
+    sampler = PriorSampler(Observing(4, sigma=0.0))
+    noise = sampler(data.clone())["prior", "noise"]
+    assert torch.equal(noise, history["actions"] + data["observation"])
+    out = sampler.select_out_keys(keys.NOISE)(data.clone())
+    assert torch.equal(out["prior", "noise"], noise) and "loc" not in out["prior"]

@@ -92,7 +92,7 @@ class PriorSampler(Drawing, TensorDictModuleBase):
         prior: Prior,
         *,
         start: StartPoint | None = None,
-        observation_key: NestedKey | None = None,
+        observation_key: NestedKey = keys.OBSERVATION,
         history_key: NestedKey = keys.HISTORY,
         source_key: NestedKey = keys.SOURCE,
         generator: torch.Generator | None = None,
@@ -122,7 +122,7 @@ class PriorSampler(Drawing, TensorDictModuleBase):
         point = source.sample(self.chosen_generator(generator), noise_factor(temperature))
         if self.start is not None:
             point = self.start(point, *self._inputs(tensordict))
-        for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):
+        for key, value in zip(self.out_keys_source, (source.loc, source.warm, point), strict=True):
             tensordict.set(key, value)
         return tensordict
 

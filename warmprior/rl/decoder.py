@@ -100,8 +100,8 @@ class PriorDecoder(TensorDictModuleBase):
         check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
         check_shape(str(keys.DELTA), delta, anchor.shape)
         noise = anchor + delta.to(anchor.dtype)  # the chunk is in the environment's precision
-        inputs = tensordict.select(self.observation_key).set(self.out_keys[0], noise)
-        return tensordict.update(self.ode(inputs).select(*self.out_keys))
+        inputs = tensordict.select(self.observation_key).set(keys.NOISE, noise)
+        return tensordict.update(self.ode(inputs).select(*self.out_keys_source))
 
     def check_env(self, env: EnvBase) -> None:
         """Check that the policy's chunks have the length and width that an environment takes.
