@@ -3,11 +3,12 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict, lazy_stack
 from torch import nn
 
 from tests.errors import raises
 from warmprior import AdaLNTransformer, ChiTransformer, PlainMLP, VelocityMLP, VelocityNetwork
-from warmprior.modules.network import TimestepEmbedding, velocity_field
+from warmprior.modules.network import TimestepEmbedding, network_observation, velocity_field
 from warmprior.modules.registry import from_config
 
 
@@ -104,3 +105,14 @@ def test_vectors_of_whole_numbers_are_read_as_floats(dtype):
         network.encodes, table = True, torch.nn.Embedding(2, 1)
         network.encode = lambda observation: table(observation).squeeze(-1)
         assert velocity_field(network, observation)(t, a).shape == (5, 4, 2)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (0, 3)])
+def test_observations_are_flattened_whatever_dimensions_their_group_has(batch):
+    rows, state = math.prod(batch), torch.randn(*batch, 2, 5)
+    expected = state.reshape(rows, 2, 5)
+    assert torch.equal(network_observation(state, torch.Size(batch)), expected)
+    for shape in (batch, (*batch, 2)):
+        group = TensorDict({"state": state}, shape)
+        for seen in (group, lazy_stack(list(group.unbind(0))) if rows and shape else group):
+            assert torch.equal(network_observation(seen, torch.Size(batch))["state"], expected)

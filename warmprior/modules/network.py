@@ -142,12 +142,10 @@ def device_of(module: nn.Module, data: Tensor | TensorDictBase | None = None) ->
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
-    """Flatten ``*B`` of an observation, ``[*B, To, *]`` or a tensordict ``[*B]``, to one dimension."""
-    if len(batch) == 1:
+    """Flatten ``*B`` of an observation, ``[*B, To, *]`` or a tensordict ``[*B, ...]``, to one dimension."""
+    if len(batch) == 1:  # torch.export would fix the number of rows
         return observation
-    if isinstance(observation, TensorDictBase):
-        return observation.reshape(batch.numel()) if batch else observation.unsqueeze(0)
-    return observation.reshape(-1, *observation.shape[len(batch) :])
+    return observation.reshape(batch.numel(), *observation.shape[len(batch) :])
 
 
 class TimestepEmbedding(nn.Module):
