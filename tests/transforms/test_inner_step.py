@@ -13,7 +13,7 @@ from torchrl.envs import (
     ToTensorImage,
     TransformedEnv,
 )
-from torchrl.envs.transforms import VecNormV2
+from torchrl.envs.transforms import Transform, VecNormV2
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
@@ -105,6 +105,29 @@ def test_a_row_that_rests_keeps_everything(change):
     assert after["observation"].reshape(2, -1)[:, -4].tolist() == [H, 2 * H]
     assert after["executed_steps"].flatten().tolist() == [0, H]
     assert set(data["next"].keys()) == set(env.fake_tensordict()["next"].keys())
+
+
+class Difference(Transform):
+    """The change of the sensor in a control step."""
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset.set("change", torch.zeros_like(tensordict_reset["sensor"]))
+
+    def _step(self, tensordict, next_tensordict):
+        return next_tensordict.set("change", next_tensordict["sensor"] - tensordict["sensor"])
+
+    def transform_observation_spec(self, observation_spec):
+        return observation_spec.set("change", observation_spec["sensor"].clone())
+
+
+@pytest.mark.parametrize("workers", [False, True])
+def test_a_transform_may_read_what_was_before_while_another_row_rests(workers):
+    transforms = [ChunkStep(H)] if workers else [Difference(), ChunkStep(H)]
+    make = (lambda n: TransformedEnv(SensorsEnv(n), Difference())) if workers else SensorsEnv
+    env = TransformedEnv(SerialEnv(2, [partial(make, n) for n in LENGTHS]), Compose(*transforms))
+    steps = env.rollout(6, ChunkPolicy(half), break_when_any_done=False)["next"]
+    before = 1 / (1 / steps["sensor"] - 1)
+    torch.testing.assert_close(steps["change"], steps["sensor"] - before)
 
 
 @pytest.mark.parametrize("nested", [False, True])

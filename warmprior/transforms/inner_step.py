@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase, is_leaf_nontensor, is_non_tensor
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
@@ -87,7 +88,8 @@ class InnerStep:
         self.transforms = before
         self.restarts = Restarts(container, before)
         states = set(self.base.state_spec.keys(True, True))
-        self.observed = [key for key in self.base.observation_spec.keys(True, True) if key not in states]
+        leaves = self.base.observation_spec.items(True, True)
+        self.observed = {key: leaf for key, leaf in leaves if key not in states}
         self._done_spec = self.base.full_done_spec
         self._done_shapes = [(key, spec.shape) for key, spec in self._done_spec.items(True, True)]
         inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
@@ -134,11 +136,12 @@ class InnerStep:
         return result
 
 
-def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:
+def set_aside(tensordict: TensorDictBase, observed: Mapping[NestedKey, TensorSpec | None]) -> None:
     """Move observations to :data:`KEPT` during a partial step of a batched environment.
 
     For rows that it does not step, the environment returns the entries of the step's input, and fails, or
-    casts silently, if a transform has changed their shape or dtype.
+    casts silently, if a transform has changed their shape or dtype. An observation that still fits its spec
+    stays: transforms of the workers may read it.
     """
     rows, kept = tensordict.get("_step", None), tensordict.get(KEPT, None)
     if rows is None or not rows.any():
@@ -146,9 +149,11 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
     if kept is None:
         kept = tensordict.empty()
         tensordict.set(KEPT, kept)
-    for key in observed:
+    for key, spec in observed.items():
         value = tensordict.get(key, None)
-        if value is not None and not is_non_tensor(value):
+        if value is None or is_non_tensor(value):
+            continue
+        if spec is None or (value.shape, value.dtype) != (spec.shape, spec.dtype):
             # Entries nested under the key may have been set aside before.
             kept.update(tensordict.select(key))
             tensordict.del_(key)

@@ -48,7 +48,7 @@ class ObservationStack(EnvTransform):
         self.observation_key = unravel_key(observation_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        set_aside(tensordict, [self.observation_key])
+        set_aside(tensordict, {self.observation_key: None})
         return tensordict
 
     def _stack(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
