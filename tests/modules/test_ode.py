@@ -77,6 +77,7 @@ def test_bad_options():
     for options, *facts in (
         *(({"solver": "dopri5"}, "'dopri5'", "euler", "rk4"), ({"nfe": 0}, "nfe", 0)),
         ({"nfe": 3, "solver": "heun"}, "heun", 3),
+        ({"start_time": 1.0}, "start_time", 1.0),
         *(({"clip": clip}, "clip") for clip in (0.0, (1.0, -1.0), ())),
     ):
         with raises(ValueError, *facts):

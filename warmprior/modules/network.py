@@ -18,7 +18,7 @@ from warmprior.modules.registry import Registered
 class VelocityNetwork(nn.Module, Registered):
     """The base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
 
-    :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any callable with the same
+    :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any module with the same
     signature. This class adds shape checks, and ``config()`` with its name and constructor arguments.
 
     Args:

@@ -282,6 +282,7 @@ class ODEActor(TensorDictModuleBase):
         **sampling: Any,
     ) -> None:
         super().__init__()
+        check_share(start_time=start_time)
         self.sampling = Sampling(**sampling)
         clip, width = self.sampling.clip, getattr(network, "action_dim", None)
         if isinstance(clip, tuple) and width not in (None, len(clip)):
