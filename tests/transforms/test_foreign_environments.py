@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from tensordict import NonTensorData, TensorDict
+from tensordict import NonTensorData, NonTensorStack, TensorDict
 from torchrl.data import Categorical, Composite, MultiCategorical, NonTensor, OneHot, Unbounded
 from torchrl.envs import (
     ActionDiscretizer,
@@ -243,16 +243,21 @@ def test_environments_that_chunks_do_not_fit():
             env.rollout(2, ChunkPolicy(lambda data, zeros=zeros: zeros))
 
 
-def test_a_number_is_no_observation():
+def test_a_number_and_text_are_no_observations():
     data = demonstrations().set("observation", torch.zeros(60))
     with raises(ValueError, "'observation'"):
         window_replay_buffer(data, PRIOR, batch_size=4)
+    words = NonTensorStack(*["go"] * 60)
+    data = demonstrations().set("observation", TensorDict({"state": torch.zeros(60, 2), "task": words}, [60]))
+    with raises(ValueError, "'task'", "text"):
+        window_replay_buffer(data, PRIOR, batch_size=4)
     with raises(ValueError, "'frame'", "float32"):
         window_transforms(demonstrations(), PRIOR)(TensorDict({"frame": torch.zeros(2)}, [2]))
-    env = CountingEnv(9)
-    env.observation_spec = Composite(observation=Unbounded(()))
-    with raises(ValueError, "'observation'", "UnsqueezeTransform"):
-        _ = TransformedEnv(env, policy_transforms(PRIOR)).observation_spec
+    for name, spec in (("observation", Unbounded(())), ("task", Composite(task=NonTensor(())))):
+        env = CountingEnv(9)
+        env.observation_spec = Composite(observation=spec)
+        with raises(ValueError, f"'{name}'", "text", "UnsqueezeTransform"):
+            _ = TransformedEnv(env, policy_transforms(PRIOR)).observation_spec
 
 
 @pytest.mark.slow

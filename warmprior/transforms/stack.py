@@ -117,7 +117,8 @@ class ObservationStack(EnvTransform):
             if leaf.ndim == time:
                 raise ValueError(
                     f"ObservationStack takes vectors or images, but {key or self.observation_key!r} is a "
-                    "number per row: make it a vector before, for instance with UnsqueezeTransform"
+                    "number or text per row: make it a vector before, for instance with UnsqueezeTransform, "
+                    "or keep text beside the observation"
                 )
             shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
             name = unravel_key((self.observation_key, key)) if key else self.observation_key

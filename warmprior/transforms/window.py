@@ -6,7 +6,7 @@ import warnings
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
@@ -145,12 +145,13 @@ def _checked(
         action = action.to(torch.get_default_dtype())
     observations = {observation_key: observation}
     if is_tensor_collection(observation):
-        nested = observation.items(True, True)
+        nested = observation.items(True, True, is_leaf=is_leaf_nontensor)
         observations = {unravel_key((observation_key, key)): value for key, value in nested}
     for key, value in (*observations.items(), (keys.ACTION, action)):
         if value.ndim < 2:
             raise ValueError(
-                f"observations must be vectors or images, but {key!r} is a number per step: unsqueeze it"
+                f"observations must be vectors or images, but {key!r} is a number or text per step: "
+                "unsqueeze it, or keep text beside the observation"
             )
         check_finite_steps(key, value)
     return observations, action, episode.flatten()
