@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -245,7 +246,7 @@ def test_paths_that_cannot_be():
         FlowMatchingLoss(actor, interpolant=LinearInterpolant())
 
 
-def test_windows_of_another_prior():
+def test_windows_of_another_prior_and_with_keys_of_their_own():
     windows = buffer_of(gaussian_steps(episodes=2), PastPrior(2), 8).sample()
     with raises(ValueError, 2, "PreviewPrior", 4):
         SourceMoments.fit(windows, PreviewPrior(2))
@@ -253,3 +254,17 @@ def test_windows_of_another_prior():
     folded = windows.reshape(2, 4)
     again = SourceMoments.fit(folded, PastPrior(2), generator=torch.Generator().manual_seed(0))
     assert torch.equal(flat.covariance, again.covariance)
+
+    class Seeing(PastPrior):
+        name = "seeing-of-the-moments"
+
+        def distribution(self, history, observation=None):
+            source = super().distribution(history)
+            return replace(source, loc=source.loc + observation[:, -1:, :1])
+
+    fits, seen = [], torch.randn(8, 2, 3)
+    for key in ("observation", "seen"):
+        data = windows.copy().set(key, seen)
+        generator = torch.Generator().manual_seed(0)
+        fits.append(SourceMoments.fit(data, Seeing(2), observation_key=key, generator=generator).source_mean)
+    assert torch.equal(*fits) and not torch.equal(fits[0], flat.source_mean)

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
@@ -102,6 +103,7 @@ class SourceMoments(nn.Module):
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         samples: int = 16_384,
         trend: PoseTrend | None = None,
+        observation_key: NestedKey = keys.OBSERVATION,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
         """Estimate moments from unpadded positions of training windows and draws of the prior.
@@ -115,6 +117,7 @@ class SourceMoments(nn.Module):
             coupling: how the training pairs sources and targets, see :data:`~warmprior.Coupling`.
             samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
+            observation_key: key of the policy's observation, which the prior, coupling or trend may read.
             generator: draws the source samples, on the windows' device.
 
         Raises:
@@ -131,7 +134,7 @@ class SourceMoments(nn.Module):
         if len(batch) < 2:
             raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
         check_positions(keys.CHUNK, batch[keys.CHUNK], prior)
-        observation = batch.get(keys.OBSERVATION, None)
+        observation = batch.get(observation_key, None)
         source = prior.distribution(batch[keys.HISTORY], observation)
         a0, a1 = source.sample(generator), batch[keys.CHUNK]
         if coupling is not None:
@@ -145,7 +148,7 @@ class SourceMoments(nn.Module):
             a0, a1 = map(torch.cat, zip(*(coupling(*part) for part in parts), strict=True))
         a0, a1 = a0.double(), a1.double()
         if trend is not None:
-            source_trend, target_trend = trend(batch[keys.OBSERVATION].float())
+            source_trend, target_trend = trend(observation.float())
             a0, a1 = a0 - source_trend, a1 - target_trend
         weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
         count = weight.sum(0)
