@@ -65,8 +65,9 @@ def environment(policy, seed=0):
     return TransformedEnv(inner, Compose(transforms, EncodeObservation(policy), PriorAnchor(policy)))
 
 
-def test_features_are_those_of_the_policy_in_evaluation_mode(policy):
-    policy.train()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_features_are_those_of_the_policy_in_evaluation_mode(policy, dtype):
+    policy.to(dtype).train()
     env = environment(policy)
     check_env_specs(env, break_when_any_done="both")
     reading = policy.replace(observation_key="features")

@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from warmprior import keys
 from warmprior.checks import check_distinct, check_keys, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.network import encoded, network_observation
+from warmprior.modules.network import encoded, network_observation, precision_of
 from warmprior.transforms.inner_step import EnvTransform
 
 _SIM_STATE = ": build the environment with sim_state=True"
@@ -146,5 +146,6 @@ class EncodeObservation(EnvTransform):
         """Add the features."""
         network = self.network
         shape = (*observation_spec.shape, network.observation_steps, network.observation_dim)
-        observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device)
+        like = {"dtype": precision_of(network), "device": observation_spec.device}
+        observation_spec[self.out_keys[0]] = Unbounded(shape, **like)
         return observation_spec
