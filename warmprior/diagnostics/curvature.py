@@ -78,7 +78,7 @@ def branching_cost(
     path = getattr(policy.network, "interpolant", LinearInterpolant())
     generator = policy.sampler.chosen_generator(generator)
     with evaluation_mode(policy):
-        a0 = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key]).sample(generator)
+        a0 = policy.sampler.source(rows).sample(generator)
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
@@ -231,8 +231,7 @@ def curvature(
     parts = []
     with evaluation_mode(policy):
         # All sources are drawn at once, so that splitting the batch does not change them.
-        generator = policy.sampler.chosen_generator(generator)
-        a0 = policy.prior.distribution(rows[keys.HISTORY], rows[policy.observation_key]).sample(generator)
+        a0 = policy.sampler.source(rows).sample(policy.sampler.chosen_generator(generator))
         for i in range(0, len(rows), SPLIT):
             s = slice(i, i + SPLIT)
             parts.append(_measure(policy, a0[s], rows[policy.observation_key][s], n_steps))
@@ -299,9 +298,7 @@ def flow_paths(
     check_flow(policy, n_steps)
     windows = flat_windows(policy, batch)
     with evaluation_mode(policy):
-        generator = policy.sampler.chosen_generator(generator)
-        source = policy.prior.distribution(windows[keys.HISTORY], windows[policy.observation_key])
-        a0 = source.sample(generator)
+        a0 = policy.sampler.source(windows).sample(policy.sampler.chosen_generator(generator))
         field = velocity_field(policy.network, windows[policy.observation_key])
         path = integrate(field, a0, nfe=n_steps, return_path=True)
     return path.view(*batch.batch_size, *path.shape[1:])

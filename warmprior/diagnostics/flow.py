@@ -56,7 +56,7 @@ def flat_windows(
     if keys.CHUNK in flat.keys(True):
         check_positions(keys.CHUNK, flat[keys.CHUNK], policy.prior)
     with torch.no_grad():
-        source = policy.prior.distribution(flat[keys.HISTORY], flat[observation_key])
+        source = policy.sampler.source(flat)
     pad = flat.get(keys.IS_PAD, None)
     counted = torch.ones_like(source.warm) if pad is None else ~pad.unsqueeze(-1)
     return flat.update({keys.LOC: source.loc, keys.WARM: source.warm, "counted": counted})
@@ -208,8 +208,7 @@ def deployed_history(
     """
     data = previous.select(*policy.in_keys).to(flat_windows(policy, previous).device)
     with evaluation_mode(policy):
-        data.set(keys.NOISE, drawn(policy, data, generator))
-        chunk = policy.integrate(data).get(keys.CHUNK)
+        chunk = policy(data, generator=generator).get(keys.CHUNK)
         steps = torch.full((*data.batch_size, 1), policy.prior.chunk_length, device=chunk.device)
         history = advance(data[keys.HISTORY], chunk, steps)
     return TensorDict({keys.HISTORY: history}, batch_size=data.batch_size, device=chunk.device)

@@ -250,7 +250,6 @@ class HistoryShift(TensorDictModuleBase):
             dtype=actions.dtype,
             device=actions.device,
         )
-        disturbed = tensordict.clone(recurse=False)
-        disturbed.set(keys.HISTORY, shifted(history, self.std * noise))
+        disturbed = tensordict.copy().set(keys.HISTORY, shifted(history, self.std * noise))
         out = self.policy(seen_anew(self.policy, disturbed))
         return tensordict.update(out.select(*self.out_keys))

@@ -121,8 +121,8 @@ class ObservationStack(EnvTransform):
                     "or keep text beside the observation"
                 )
             shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
-            name = unravel_key((self.observation_key, key)) if key else self.observation_key
-            observation_spec[name] = leaf.unsqueeze(time).expand(shape).clone()
+            stack = leaf.unsqueeze(time).expand(shape).clone()
+            observation_spec[unravel_key((self.observation_key, key))] = stack
         return observation_spec
 
 
