@@ -1,6 +1,7 @@
 """Smoothness of rollouts against plain loops over the executed actions."""
 
 import math
+import pickle
 import random
 from itertools import pairwise
 
@@ -97,7 +98,7 @@ def test_bad_rollouts_are_named():
 
 
 @pytest.mark.parametrize("see_history", [False, True])
-def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_history):
+def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_history, monkeypatch):
     prior = GaussianPrior(2) if see_history else PastPrior(2)
     width = HistoryObservation.width(2, 1) if see_history else 0
     key = keys.CONDITIONED if see_history else keys.OBSERVATION
@@ -117,3 +118,7 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
     assert (out["history", "actions"][:2] == 1).all()
     with raises(ValueError, "std"):
         HistoryShift(actor, -1.0)
+    monkeypatch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())
+    with raises(RuntimeError, "same noise"):
+        disturbed.policy = actor.replace(generator=None)
+        pickle.loads(pickle.dumps(disturbed))(data)

@@ -24,6 +24,7 @@ from warmprior.diagnostics.flow import (
 )
 from warmprior.diagnostics.statistics import ratio
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.generator import Drawing
 
 LEAK_BOUND = 1.0
 """The largest leak of a sampler that spreads like the data; a larger one adds noise."""
@@ -203,7 +204,7 @@ def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
     return moved
 
 
-class HistoryShift(TensorDictModuleBase):
+class HistoryShift(Drawing, TensorDictModuleBase):
     """A policy with normal noise on the history that it reads, actions and forecast, at every decision.
 
     The environment's own history does not change.
@@ -244,12 +245,8 @@ class HistoryShift(TensorDictModuleBase):
         history = tensordict[keys.HISTORY]
         longest = max(history[name].shape[-2] for name in ("actions", "forecast"))
         actions = history["actions"]
-        noise = torch.randn(
-            (*actions.shape[:-2], longest, actions.shape[-1]),
-            generator=self.generator,
-            dtype=actions.dtype,
-            device=actions.device,
-        )
+        like = {"dtype": actions.dtype, "device": actions.device, "generator": self.chosen_generator()}
+        noise = torch.randn((*actions.shape[:-2], longest, actions.shape[-1]), **like)
         disturbed = tensordict.copy().set(keys.HISTORY, shifted(history, self.std * noise))
         out = self.policy(seen_anew(self.policy, disturbed))
         return tensordict.update(out.select(*self.out_keys))
