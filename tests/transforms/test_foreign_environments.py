@@ -13,6 +13,7 @@ from torchrl.envs import (
     FrameSkipTransform,
     GymEnv,
     ParallelEnv,
+    RenameTransform,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -258,6 +259,20 @@ def test_a_number_and_text_are_no_observations():
         env.observation_spec = Composite(observation=spec)
         with raises(ValueError, f"'{name}'", "text", "UnsqueezeTransform"):
             _ = TransformedEnv(env, policy_transforms(PRIOR)).observation_spec
+
+
+def test_a_state_is_not_stacked_but_its_copy_is():
+    def make():
+        env = CountingEnv(9)
+        env.state_spec = env.observation_spec.clone()
+        return env
+
+    with raises(ValueError, "'observation'", "state", "RenameTransform"):
+        TransformedEnv(make(), policy_transforms(PRIOR)).reset()
+    copied = RenameTransform(["observation"], ["seen"], create_copy=True)
+    env = TransformedEnv(make(), Compose(copied, policy_transforms(PRIOR, observation_key="seen")))
+    steps = env.rollout(3)["next"]
+    assert torch.equal(steps["seen"][:, -1], steps["observation"])
 
 
 @pytest.mark.slow

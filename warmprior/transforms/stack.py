@@ -28,7 +28,7 @@ class ObservationStack(EnvTransform):
         observation_key: key of the observation, in and out, or of entries nested under it.
 
     Raises:
-        ValueError: if ``steps < 1``.
+        ValueError: if ``steps < 1``, or the environment reads the observation as its state.
         KeyError: if the environment has no such observation, or (on a step) the input has no stack yet.
 
     Examples:
@@ -106,6 +106,15 @@ class ObservationStack(EnvTransform):
                 f"ObservationStack found {key!r} in a branch of shape {list(shape)}, in an environment of "
                 f"batch size {list(observations.shape)}: groups of agents are not supported"
             )
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Refuse to replace what the environment reads as its state."""
+        if self.observation_key in input_spec["full_state_spec"].keys(True):
+            raise ValueError(
+                f"ObservationStack would replace the environment's own state {self.observation_key!r}: make "
+                "a copy before (RenameTransform with create_copy=True), and name it with observation_key"
+            )
+        return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Insert the stack's dimension after those of the batch."""

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Compose, Transform
 
@@ -81,15 +81,12 @@ class ActionWindow(Transform):
         self.chunk_length, self.history_length = chunk_length, history_length
         observations, action, episode = _checked(data, observation_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
-        stored = dict(zip(self._observations, observations.values(), strict=True))
-        for name, value in (stored | {"action": action}).items():
+        buffers = dict(zip(self._observations, observations.values(), strict=True)) | {"action": action}
+        buffers["start"], buffers["end"] = _episode_borders(episode)
+        buffers["action_offsets"] = torch.arange(-history_length, prediction_length, device=episode.device)
+        buffers["observation_offsets"] = torch.arange(1 - observation_steps, 1, device=episode.device)
+        for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
-        start, end = _episode_borders(episode)
-        offsets = torch.arange(-history_length, prediction_length, device=start.device)
-        recent = torch.arange(1 - observation_steps, 1, device=start.device)
-        self.start, self.end, self.action_offsets, self.observation_offsets = (
-            nn.Buffer(value, persistent=False) for value in (start, end, offsets, recent)
-        )
 
     @torch.no_grad()  # an expert's rollouts may hold its gradients
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -114,8 +111,7 @@ class ActionWindow(Transform):
         history = window_history(executed, frame - start, target, self.chunk_length)
         recent = (frame + self.observation_offsets).clamp_min(start)
         written = ((key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items())
-        values = (target, is_pad, history)
-        for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
+        for key, value in (*written, *zip(self.out_keys[1:], (target, is_pad, history), strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
         return tensordict
 
