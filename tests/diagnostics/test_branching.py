@@ -87,5 +87,6 @@ def test_bound_counts_cold_and_padded_positions():
     assert bound["noise"].tolist() == [H * 0.25] * 2
     assert bound["total"].tolist() == [H * 4.25 + H * 10.0] * 2
     assert bound["total_executed"].tolist() == [H * 4.25] * 2
-    data["action_is_pad"] = torch.arange(2 * H).expand(2, -1) >= 1
-    assert branching_bound(data, prior)["total"].tolist() == [4.25] * 2
+    for dtype in (torch.bool, torch.uint8):
+        data["action_is_pad"] = (torch.arange(2 * H).expand(2, -1) >= 1).to(dtype)
+        assert branching_bound(data, prior)["total"].tolist() == [4.25] * 2

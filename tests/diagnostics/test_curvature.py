@@ -38,7 +38,7 @@ def test_executed_positions_and_padding_count_separately():
     out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data)
     assert out["speed"][1] == pytest.approx(D_A * sum(p * p for p in range(1, 2 * H + 1)))
     assert out["speed_executed"][1] == pytest.approx(D_A * (1 + 4 + 9))
-    data["action_is_pad"] = pad
+    data["action_is_pad"] = pad.long()  # numbers, as some files have them
     out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data)
     assert out["speed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 91.0] * 4)
     assert out["speed_executed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 14.0] * 4)

@@ -158,17 +158,19 @@ def test_zero_network_is_optimal_for_gaussian_data(prior, keep, withhold, path):
         assert float((mine - u).square().mean()) == pytest.approx(best, rel=0.01, abs=1e-6)
 
 
-def test_padded_positions_do_not_count():
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
+def test_padded_positions_do_not_count(dtype):
     """Every episode is 3 steps long and its last action is far away: position 3 is never seen."""
     data = steps_of(torch.tensor([[0.1], [0.2], [9.0]]).repeat(100, 1), 3)
     prior = GaussianPrior(4)
     windows = buffer_of(data, prior, batch_size=3000).sample()
+    windows["action_is_pad"] = windows["action_is_pad"].to(dtype)
     moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(0))
     assert moments.target_mean[2:].flatten().tolist() == pytest.approx([9.0, 0.0])
     assert float(moments.target_variance[2]) == pytest.approx(1e-4)  # constant: the floor
     assert float(moments.target_variance[3]) == 1.0 and float(moments.covariance[3]) == 0.0
     chunk = windows["vla_action", "chunk"][:, 1].double()
-    seen = chunk[~windows["action_is_pad"][:, 1]]
+    seen = chunk[windows["action_is_pad"][:, 1] == 0]
     assert float(moments.target_mean[1]) == pytest.approx(float(seen.mean()), rel=1e-5)
     assert float(moments.target_variance[1]) == pytest.approx(float(seen.var()), rel=1e-2)
 

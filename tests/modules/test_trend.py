@@ -97,7 +97,7 @@ def fit(batch, prior):
 
 def test_against_least_squares():
     batch = windows()
-    trend = fit(batch, GaussianPrior(P))
+    trend = fit(batch.copy().set("action_is_pad", batch["action_is_pad"].long()), GaussianPrior(P))
     resting = RestingPose(COLUMNS)(batch["observation"][:, -1]).double().numpy()
     for position in range(P):
         kept = ~batch["action_is_pad"][:, position].numpy()

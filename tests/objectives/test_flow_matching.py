@@ -171,7 +171,7 @@ def test_a_padded_target_may_be_nan():
 def test_only_padding_is_zero_and_not_nan(reduction):
     prior = PastPrior(H)
     actor, data = actor_for(prior), sample(prior, 6)
-    data["action_is_pad"] = torch.ones(6, H, dtype=torch.bool)
+    data["action_is_pad"] = torch.ones(6, H, dtype=torch.uint8)
     loss = loss_of(actor, data, reduction=reduction)
     assert (loss == 0).all()
     loss.sum().backward()

@@ -147,7 +147,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         raise ValueError(f"the bound needs a Gaussian source, and {prior} has another one")
     target, warm = batch.get(keys.CHUNK), source.warm
     pad = batch.get(keys.IS_PAD, None)
-    counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
+    counted = torch.ones_like(warm) if pad is None else pad.logical_not().unsqueeze(-1)
     squared = (target - source.loc).square()
     variance = source.scale.square().expand_as(target)
     mismatch, noise = ((value * (warm & counted)).sum((-1, -2)) for value in (squared, variance))

@@ -58,7 +58,7 @@ def flat_windows(
     with torch.no_grad():
         source = policy.sampler.source(flat)
     pad = flat.get(keys.IS_PAD, None)
-    counted = torch.ones_like(source.warm) if pad is None else ~pad.unsqueeze(-1)
+    counted = torch.ones_like(source.warm) if pad is None else pad.logical_not().unsqueeze(-1)
     return flat.update({keys.LOC: source.loc, keys.WARM: source.warm, "counted": counted})
 
 

@@ -150,7 +150,7 @@ class SourceMoments(nn.Module):
         if trend is not None:
             source_trend, target_trend = trend(observation.float())
             a0, a1 = a0 - source_trend, a1 - target_trend
-        weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
+        weight = batch[keys.IS_PAD].logical_not().unsqueeze(-1).double()
         count = weight.sum(0)
 
         def mean(values: Tensor) -> Tensor:

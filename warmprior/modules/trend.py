@@ -201,7 +201,7 @@ class PoseTrend(nn.Module):
         draws = [source.sample(generator).double() for _ in range(DRAWS)]
         ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
         # Padded positions do not count: they would pull the trend to the episode's last action.
-        weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)
+        weight = windows[keys.IS_PAD].logical_not().double().unsqueeze(-1)
         weight = weight / weight.sum(0).clamp_min(1)
         deviation = resting.unsqueeze(1) - (weight * resting.unsqueeze(1)).sum(0)
         variance = (weight * deviation.square()).sum(0)

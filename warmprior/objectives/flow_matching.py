@@ -197,15 +197,14 @@ class FlowMatchingLoss(Drawing, LossModule):
     def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> tuple[Tensor | None, bool]:
         """Return the positions' weights ``[*B, P]``, ``None`` if all are equal, and if windows are masked."""
         pad, weight = tensordict.get(self.tensor_keys.pad_mask, None), None
-        masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
-        factors = [None if pad is None else ~pad, self._maybe_get_priority_weight(tensordict), *masks]
-        for factor in factors:
+        masks = [mask for key in self._loss_mask_keys() if (mask := tensordict.get(key, None)) is not None]
+        inside = None if pad is None else pad.logical_not()
+        for factor in (inside, self._maybe_get_priority_weight(tensordict), *masks):
             if factor is not None:
                 # A factor weights windows `[*B]` or `[*B, 1]`, or positions `[*B, P]`.
                 factor = factor.to(a1).reshape(*factor.shape, *(1,) * (a1.ndim - 1 - factor.ndim))
                 weight = factor if weight is None else weight * factor
-        masked = any(mask is not None for mask in masks)
-        return None if weight is None else weight.expand(a1.shape[:-1]), masked
+        return None if weight is None else weight.expand(a1.shape[:-1]), bool(masks)
 
     def _error(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
         """Return the objective's error ``[*B, P, d_a]`` of velocities predicted at times ``t`` ``[*B]``."""
