@@ -116,10 +116,13 @@ def loss_of(actor, data, **options):
     return FlowMatchingLoss(actor, **options)(data)["loss_flow_matching"]
 
 
-def test_batch_shapes_agree():
+def test_batch_shapes_and_whole_numbers_agree():
     prior = PastPrior(H)
     actor, data = actor_for(prior), sample(prior, 2, 3)
     torch.testing.assert_close(loss_of(actor, data), loss_of(actor, data.reshape(6)))
+    whole = data.copy().set(("vla_action", "chunk"), data["vla_action", "chunk"].round())
+    numbers = whole.copy().set(("vla_action", "chunk"), whole["vla_action", "chunk"].long())
+    assert torch.equal(loss_of(actor, whole), loss_of(actor, numbers))  # as chunks of one-hot actions
 
 
 def test_no_pad_mask_counts_everything():

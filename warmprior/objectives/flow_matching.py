@@ -177,6 +177,7 @@ class FlowMatchingLoss(Drawing, LossModule):
         device = device_of(actor.network, tensordict.get(k.chunk))
         a1, history, observation = (tensordict.get(key).to(device) for key in needed)
         check_positions(k.chunk, a1, actor.prior)
+        a1 = a1 if a1.is_floating_point() else a1.to(torch.get_default_dtype())
         weight, masked = self._weight(tensordict, a1)
         if weight is not None:
             # Masked windows and padded targets may be NaN, and would make all gradients NaN.
