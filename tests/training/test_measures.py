@@ -129,6 +129,17 @@ def test_a_reward_may_be_summed(told):
         assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))
 
 
+def test_a_reward_may_say_success():
+    class Paying(Saying):
+        def _step(self, tensordict):
+            result = super()._step(tensordict)
+            return result.set("reward", (result["reward"] >= 6).float())  # up to three times in a chunk
+
+    env = TransformedEnv(Paying(), policy_transforms(PastPrior(H), observation_steps=1, success="reward"))
+    for episode in evaluate(POLICY, env, episodes=4, first_seed=0, success="reward"):
+        assert episode.success == (length(episode.seed) >= 6)
+
+
 def test_a_flag_of_success_may_be_counted_too():
     """Over the steps of a chunk, of which the last must not say yet that any succeeded."""
     measures = {"won": "sum"}

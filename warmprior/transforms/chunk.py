@@ -354,14 +354,13 @@ class ChunkStep(EnvTransform):
             return [v if rows is None else torch.where(expand_as_right(rows, v), v, 0) for v, rows in pairs]
 
         # Combined before they are written, because the result of the last step is written into.
-        whole: dict[NestedKey, Tensor] = {}
+        whole = {reward_key: self._return(terms(reward_key))}
         flagged = next_tensordict.get(self.success, None) is not None
         for key, how in ({self.success: "max", **self.measures} if flagged else self.measures).items():
             if how == "sum":
-                whole[key] = torch.stack(terms(key)).sum(0)
+                whole.setdefault(key, torch.stack(terms(key)).sum(0))  # a reward's is its return
             else:
                 whole[key] = torch.stack([result.get(key) for result in results]).amax(0)
-        whole[reward_key] = self._return(terms(reward_key))
         masks = [rows for rows in ran if rows is not None]
         steps = torch.full(batch, len(ran) - len(masks), dtype=torch.int64, device=next_tensordict.device)
         whole[keys.EXECUTED] = sum(masks, steps).unsqueeze(-1)
