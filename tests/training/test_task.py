@@ -8,7 +8,7 @@ import h5py
 import pytest
 import torch
 from tensordict import NonTensorStack, TensorDict
-from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs import RenameTransform, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
@@ -16,7 +16,7 @@ from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
-from warmprior import GaussianPrior, PoseTrend, RestingJoints
+from warmprior import GaussianPrior, PoseTrend, RestingJoints, keys
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
 from warmprior.training import NetworkOptions, Task, TrainingConfig
@@ -229,8 +229,12 @@ def test_an_environment_with_transforms_of_its_own_takes_random_chunks():
         lambda: TransformedEnv(NavigationEnv(), StepCounter()),
     )
     env = task.env(GaussianPrior(4))
-    check_env_specs(env)
-    assert env.rollout(2)["next", "step_count"].flatten().tolist() == [4, 8]
+    renamed = TransformedEnv(task.env(GaussianPrior(4)), RenameTransform([], [], [keys.CHUNK], ["plan"]))
+    for each, key in ((env, keys.CHUNK), (renamed, "plan")):
+        check_env_specs(each)
+        rollout = each.rollout(2)
+        assert rollout[key].shape == (2, 4, 1)
+        assert rollout["next", "step_count"].flatten().tolist() == [4, 8]
 
 
 def test_an_environment_with_images_fits_its_demonstrations():

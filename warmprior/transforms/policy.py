@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
@@ -24,9 +23,8 @@ from warmprior.transforms.stack import ObservationStack
 class PolicyEnv(TransformedEnv):
     """An environment with a policy's transforms; its own stay inside, as TorchRL unwraps no subclass."""
 
-    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Draw a chunk, which TorchRL refuses to do around an environment with transforms of its own."""
-        return EnvBase.rand_action(self, tensordict)
+    # TorchRL draws no random action through transforms that change it if a class inside has a method for it.
+    rand_action = EnvBase.rand_action
 
 
 def policy_transforms(
