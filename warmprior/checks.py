@@ -63,12 +63,12 @@ def check_between(low: float, high: float, /, **values: Any) -> None:
 
 
 def is_true(key: NestedKey, value: Any) -> bool:
-    """Return a flag that says whether a task is solved; raise ValueError for a number but 0 and 1."""
-    number = torch.as_tensor(value).item()
-    if number not in (0, 1):
+    """Return a flag that says whether a task is solved; raise ValueError for all but 0 and 1."""
+    number = torch.as_tensor(value)
+    if number.numel() != 1 or number.item() not in (0, 1):
         raise ValueError(
-            f"success is read from {key!r}, which is {number:g} and neither True (1) nor False (0): have the "
-            "environment write a flag, and name this number in measures"
+            f"success is read from {key!r}, which is {number.tolist()} and neither True (1) nor False (0): "
+            "have the environment write a flag, and name this number in measures"
         )
     return bool(number)
 

@@ -116,9 +116,14 @@ def test_info_replaces_nothing_else_that_a_step_returns(name):
         gym_env(gymnasium.vector.SyncVectorEnv([lambda: Telling(nested=True)], autoreset_mode=mode))
 
 
-def test_a_fraction_is_no_success():
-    env = gym_env(Dial(), success="height")
-    with raises(ValueError, "'height'", "measures"):
+@pytest.mark.parametrize("value", [0.5, -1, float("nan"), np.array([True, False])])
+def test_a_fraction_is_no_success(value):
+    class Saying(Dial):
+        def step(self, action):
+            return *super().step(action)[:4], {"solved": value}
+
+    env = gym_env(Saying(), success="solved")
+    with raises(ValueError, "'solved'", "measures"):
         env.rollout(5)
 
 
