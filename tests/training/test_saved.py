@@ -99,6 +99,12 @@ def test_round_trip_is_bit_identical(tmp_path, make):
     assert same(actor.state_dict(), again.state_dict())
 
 
+def test_a_compiled_policy_is_saved_as_the_policy_inside(tmp_path):
+    actor = policy()
+    save_policy(torch.compile(actor, backend="eager"), tmp_path)
+    assert torch.equal(chunk(load_policy(tmp_path)), chunk(actor))
+
+
 @pytest.mark.parametrize("parts", ["all", "network", "normalizer"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
 def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):

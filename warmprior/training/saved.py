@@ -104,11 +104,11 @@ def check_repository(name: str) -> None:
 
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     """Return everything except the weights as JSON; raise TypeError if JSON cannot hold a part."""
-    network = uncompiled(actor.network)
+    actor, network = uncompiled(actor), uncompiled(actor.network)
     if type(actor) is not WarmPriorActor:  # a plain actor would be loaded
         raise TypeError(
             f"cannot save {type(actor).__name__}: only WarmPriorActor itself is saved; put what the subclass "
-            "adds into a prior, start point or network, or save its state_dict()"
+            "adds into a prior, start point or network, or save a WarmPriorActor of its parts without that"
         )
     if not isinstance(network, VelocityNetwork):
         raise TypeError(f"cannot save {type(network).__name__}: only subclasses of VelocityNetwork are saved")
