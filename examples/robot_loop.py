@@ -5,7 +5,7 @@ python examples/robot_loop.py --camera            # the policy sees the goal onl
 python examples/robot_loop.py --decision 0.2      # decisions take longer than a chunk, so the robot holds
 python examples/robot_loop.py --unplug 3          # the robot stops answering after three seconds
 
-For your own robot write the five methods of SimulatedArm, and load your policy in main().
+For your own robot write the five methods of SimulatedArm, and load your policy in play().
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Play with the options of the command line, and return the exit code."""
+    """Read the options of the command line, play, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     add = parser.add_argument
     add("--rate", type=float, default=50.0, help="control steps per second (default: %(default)s)")
@@ -237,7 +237,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--unplug", type=float, default=math.inf, help="seconds until the robot stops answering")
     add("--iterations", type=int, default=300, help="iterations of the training (default: %(default)s)")
     options = parser.parse_args(argv)
-    # It reports errors in one line, and leaves a core to the loop.
+    # Errors become one line, and PyTorch has one thread, which leaves a core to the loop.
     return run_script(lambda: play(options), "robot_loop.py", errors=(*ERRORS, RuntimeError))
 
 
