@@ -186,8 +186,7 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        own = policy if isinstance(policy, WarmPriorAdapter) else getattr(policy, "warm_adapter", None)
-        adapter: WarmPriorAdapter | None = own
+        adapter = policy if isinstance(policy, WarmPriorAdapter) else getattr(policy, "warm_adapter", None)
         if adapter is not None:
             policy = adapter.policy
             if adapter.guidance is not None:

@@ -168,14 +168,13 @@ def train_policy(
             "train_policy takes a file or dataset, a TensorDict or replay buffer of steps, or a Task, got "
             f"{type(demonstrations).__name__}"
         )
-    on_cpu = torch.device(device).type == "cpu"
+    home = torch.device(device)
     if directory is None and world_size() > 1:
         raise ValueError("processes that train together need a directory that all of them see")
     with ExitStack() as stack:
-        stack.enter_context(torch_threads(1 if on_cpu else None))
+        stack.enter_context(torch_threads(1 if home.type == "cpu" else None))
         # The training seeds PyTorch's global generator, whose state is restored at the end.
-        on_gpu = torch.device(device).type == "cuda"
-        stack.enter_context(torch.random.fork_rng([torch.device(device)] if on_gpu else []))
+        stack.enter_context(torch.random.fork_rng([home] if home.type == "cuda" else []))
         if logger is not None:  # some loggers write in exit handlers, which a killed process does not run
             stack.enter_context(closing(logger))  # type: ignore[type-var]
         if directory is None:
