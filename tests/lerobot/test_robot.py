@@ -15,7 +15,7 @@ from tests.lerobot.plugin_policies import saved_flow_policy, small, warm
 from tests.lerobot.test_actor import preprocessed
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
 from tests.toy_env import stirred
-from warmprior import PastPrior, RealTimeChunking
+from warmprior import ChunkStep, PastPrior, RealTimeChunking, policy_transforms
 from warmprior.deploy import AsyncExecutor
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
 
@@ -90,6 +90,8 @@ def test_a_warm_flow_policy_acts_by_its_averaged_weights(found, tmp_path, camera
         actions = [executor.act(observation) for observation in seen]
     torch.testing.assert_close(torch.stack(actions), torch.stack(expected), rtol=1e-4, atol=1e-4)
     assert torch.stack(expected)[:, 0].std() > 0.01
+    chunks = next(t for t in policy_transforms(actor) if isinstance(t, ChunkStep))
+    assert chunks.execute == executor.execute == policy.config.n_action_steps
 
 
 @pytest.mark.parametrize("adapted", [False, True])

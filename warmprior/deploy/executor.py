@@ -35,7 +35,7 @@ from warmprior.modules.network import device_of, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.delay import check_delay
+from warmprior.transforms.delay import check_delay, usual_execute
 from warmprior.transforms.history import HistoryObservation
 
 
@@ -129,9 +129,7 @@ class AsyncExecutor:
         check_positive(**given(control_rate=control_rate))
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
-        if execute is None:
-            own = max(getattr(plain, "execute", length), expected)
-            execute = min(own, prior.chunk_length, length - expected)
+        execute = usual_execute(plain, prior, expected) if execute is None else execute
         check_delay(expected, execute, length)
         check_between(1, prior.chunk_length, execute=execute)
         if normalizer is not None and keys.ACTION not in normalizer.keys:

@@ -10,6 +10,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from warmprior import keys
 from warmprior.checks import check_keys, check_whole_numbers
+from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
@@ -32,6 +33,12 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
             f"predictions of {length} actions do not cover {execute} executed ones and a delay of {delay}: "
             f"execute at most {length - delay} per decision, or predict longer chunks"
         )
+
+
+def usual_execute(policy: object, prior: Prior, delay: int) -> int:
+    """Return the number of actions per decision: the policy's ``execute`` or ``H``, as the delay allows."""
+    own = max(getattr(policy, "execute", prior.chunk_length), delay)
+    return min(own, prior.chunk_length, prior.prediction_length - delay)
 
 
 def executed_chunk(

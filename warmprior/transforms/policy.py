@@ -15,7 +15,7 @@ from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
-from warmprior.transforms.delay import InferenceDelay, check_delay
+from warmprior.transforms.delay import InferenceDelay, check_delay, usual_execute
 from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
 
@@ -59,7 +59,8 @@ def policy_transforms(
             :class:`AbsoluteActions`; it is copied.
         images: transform that adds images to observations, such as :class:`CameraImages`; it is copied.
         observation_steps: ``To``; by default that of the policy's network, or 2.
-        execute: actions executed per decision; ``H`` by default; with a ``delay``, at most ``P - delay``.
+        execute: actions executed per decision; by default ``H`` (of a LeRobot policy its
+            ``n_action_steps``); with a ``delay``, at most ``P - delay``.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 if the
             policy has :class:`~warmprior.RealTimeChunking`; otherwise no delay is written.
         gamma: discount per control step inside a chunk.
@@ -103,12 +104,11 @@ def policy_transforms(
             f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: fit it "
             "to data with that key"
         )
+    execute = usual_execute(policy, prior, delay or 0) if execute is None else execute
     late: list[Transform] = []
     if see_history:
         late.append(HistoryObservation(observation_key=observation_key, history_key=history_key))
     if delay is not None:
-        if execute is None:
-            execute = min(prior.chunk_length, prior.prediction_length - delay)
         check_delay(delay, execute, prior.prediction_length)
         late.append(InferenceDelay(delay, execute=execute, chunk_key=chunk_key, history_key=history_key))
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
