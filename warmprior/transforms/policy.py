@@ -59,7 +59,7 @@ def policy_transforms(
             :class:`AbsoluteActions`; it is copied.
         images: transform that adds images to observations, such as :class:`CameraImages`; it is copied.
         observation_steps: ``To``; by default that of the policy's network, or 2.
-        execute: actions executed per decision; by default ``H`` (of a LeRobot policy its
+        execute: actions executed per decision; by default ``H`` (of a ``warm_flow`` policy its
             ``n_action_steps``); with a ``delay``, at most ``P - delay``.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 if the
             policy has :class:`~warmprior.RealTimeChunking`; otherwise no delay is written.
