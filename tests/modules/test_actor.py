@@ -197,26 +197,27 @@ class Chunks(nn.Module):
         self.actor = actor
 
     def forward(self, observation, *history):
-        shape = observation.shape[:1]
+        shape = observation.shape[:-2]
         data = TensorDict(dict(zip(ENTRIES, history, strict=True)), shape)
         data = TensorDict({"observation": observation, "history": data}, shape)
         return self.actor(data)[keys.CHUNK]
 
 
-def test_policies_compile_and_export_for_every_batch_size():
+@pytest.mark.parametrize("batches", [[(3,), (2,), (5,)], [(3, 2), (4, 5)]])
+def test_policies_compile_and_export_for_every_batch_size(batches):
     policy = Chunks(actor_for(PastPrior(H, sigma=0.0), nfe=2).eval())
 
-    def inputs(count):
-        data = batch(policy.actor.prior, count)
-        data["history", "steps"] = torch.full((count, 1), H)  # nothing is drawn
+    def inputs(shape):
+        data = batch(policy.actor.prior, *shape)
+        data["history", "steps"] = torch.full((*shape, 1), H)  # nothing is drawn
         return (data["observation"], *(data["history", name] for name in ENTRIES))
 
-    rows = torch.export.Dim("rows", min=2, max=64)
-    options = {"dynamic_shapes": {"observation": {0: rows}, "history": ({0: rows},) * 4}}
+    rows = {i: torch.export.Dim(f"rows{i}", min=2, max=64) for i in range(len(batches[0]))}
+    options = {"dynamic_shapes": {"observation": rows, "history": (rows,) * 4}}
     with torch.no_grad():
-        exported = torch.export.export(policy, inputs(3), **options).module()
+        exported = torch.export.export(policy, inputs(batches[0]), **options).module()
         compiled = torch.compile(policy, backend="eager")
-        for count in (2, 3, 5):
-            given = inputs(count)
+        for shape in batches:
+            given = inputs(shape)
             torch.testing.assert_close(exported(*given), policy(*given))
             torch.testing.assert_close(compiled(*given), policy(*given))

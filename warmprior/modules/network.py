@@ -143,9 +143,10 @@ def device_of(module: nn.Module, data: Tensor | TensorDictBase | None = None) ->
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
     """Flatten ``*B`` of an observation, ``[*B, To, *]`` or a tensordict ``[*B, ...]``, to one dimension."""
-    if len(batch) == 1:  # torch.export would fix the number of rows
+    if len(batch) == 1:
         return observation
-    return observation.reshape(batch.numel(), *observation.shape[len(batch) :])
+    # Not batch.numel(), with which torch.export would fix the number of rows.
+    return observation.reshape(math.prod(batch), *observation.shape[len(batch) :])
 
 
 class TimestepEmbedding(nn.Module):
