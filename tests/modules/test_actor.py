@@ -138,6 +138,10 @@ def test_keys_of_its_own_give_the_same_chunks():
     source = [("left", "source", name) for name in ("loc", "warm", "noise")]
     assert own.out_keys == [*source, ("left", "chunk")]
     assert own.replace(nfe=1).tensor_keys == OWN_KEYS
+    written = {"observation_key": ("prior", ("observation",)), "history_key": ("history",)}  # other forms
+    usual = own.replace(**written, source_key=("prior",), chunk_key=(("vla_action",), "chunk"))
+    assert usual.tensor_keys == actor.tensor_keys | {"observation_key": keys.CONDITIONED}
+    assert usual.sees_history
 
 
 def test_dispatch_takes_tensors_and_returns_tensors():

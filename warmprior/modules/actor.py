@@ -215,39 +215,28 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the network was built for prediction_length={built_for}, but {prior} needs "
                 f"{prior.prediction_length}"
             )
-        #: Keys of the policy's inputs and outputs, as arguments of the constructor.
-        self.tensor_keys: dict[str, NestedKey] = {
+        observation_key, chunk_key = unravel_key(observation_key), unravel_key(chunk_key)
+        read: dict[str, NestedKey] = {
             "observation_key": observation_key,
-            "history_key": history_key,
-            "source_key": source_key,
-            "chunk_key": chunk_key,
+            "history_key": unravel_key(history_key),
+            "source_key": unravel_key(source_key),
         }
-        self.ode = ODEActor(
-            network,
-            start_time=0.0 if start is None else start.time,
-            guidance=guidance,
-            **self.tensor_keys,
-            **sampling,
-        )
-        self.sampler = PriorSampler(
-            prior,
-            start=start,
-            observation_key=observation_key,
-            history_key=history_key,
-            source_key=source_key,
-            generator=generator,
-        )
+        #: Keys of the policy's inputs and outputs, as arguments of the constructor.
+        self.tensor_keys = read | {"chunk_key": chunk_key}
+        began = 0.0 if start is None else start.time
+        self.ode = ODEActor(network, start_time=began, guidance=guidance, **self.tensor_keys, **sampling)
+        self.sampler = PriorSampler(prior, start=start, generator=generator, **read)
         #: The options for drawing a chunk.
         self.sampling = self.ode.sampling
-        self.observation_key, self.history_key = observation_key, history_key
+        self.observation_key, self.history_key = observation_key, read["history_key"]
         #: True if the network sees the last actions, see :class:`~warmprior.HistoryObservation`.
         self.sees_history = observation_key == keys.CONDITIONED
         self.normalizer = normalizer
         self.environment = environment
         #: Specs of outputs, by their keys.
         self.spec = spec if spec is None or isinstance(spec, Composite) else Composite({chunk_key: spec})
-        guided = [] if guidance is None else [keys.DELAY]
-        self.in_keys = list(dict.fromkeys([observation_key, *self.sampler.in_keys, *guided]))
+        _, *read_by_flow = self.ode.in_keys
+        self.in_keys = list(dict.fromkeys([observation_key, *self.sampler.in_keys, *read_by_flow]))
         self.out_keys = [*self.sampler.out_keys, chunk_key]
 
     @property
