@@ -1,6 +1,7 @@
 """Guidance by the rest of the last chunk: against the published formulas, LeRobot and known posteriors."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -231,6 +232,20 @@ def test_the_actor_knows_the_sigma_of_its_source():
         for i in range(4):
             a = a + guided(torch.full((5,), i / 4), a) / 4
     torch.testing.assert_close(found["vla_action", "chunk"], a)
+
+
+def test_the_deviation_of_a_source_may_be_a_number():
+    class Even(PastPrior):
+        name = "even-of-the-tests"
+
+        def distribution(self, history, observation=None):
+            return replace(super().distribution(history), scale=0.5)  # as PastPrior has where it is warm
+
+    policy, data = actor(PastPrior(4), guidance=RealTimeChunking()), decision(PastPrior(4), 3)
+    data["history", "steps"].fill_(4)
+    even = policy.replace(prior=Even(4))
+    one, other = (p(data.clone(), generator=torch.Generator().manual_seed(7)) for p in (policy, even))
+    assert torch.equal(one["vla_action", "chunk"], other["vla_action", "chunk"])
 
 
 def test_missing_keys_and_decoders():

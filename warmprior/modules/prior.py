@@ -29,7 +29,7 @@ class Source:
 
     Attributes:
         loc: :math:`\mu`, ``[*B, P, d_a]``, normalised action space.
-        scale: :math:`s`, broadcastable to ``loc``.
+        scale: :math:`s`, broadcastable to ``loc``; a number becomes a tensor.
         warm: True at positions whose mean comes from the history, bool ``[*B, P, 1]``.
         correlation: share of the noise's variance that is common to all warm positions of a dimension.
 
@@ -45,6 +45,10 @@ class Source:
     scale: Tensor
     warm: Tensor
     correlation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scale, Tensor):
+            object.__setattr__(self, "scale", self.loc.new_tensor(self.scale))
 
     def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> Tensor:
         """Draw ``a_0 = loc + temperature * scale * eps``, ``[*B, P, d_a]``.
