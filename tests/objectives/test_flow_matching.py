@@ -19,6 +19,7 @@ from warmprior import (
     Source,
     window_replay_buffer,
 )
+from warmprior.history import history_keys
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 H, D_A, D_O = 3, 2, 5
@@ -207,8 +208,11 @@ def test_set_keys(nested):
         renamed[new[name]] = data[old[name]]
     loss = FlowMatchingLoss(actor, generator=torch.Generator().manual_seed(2))
     loss.set_keys(**new)
-    assert set(loss.in_keys) == set(new.values())
+    history = history_keys(new.pop("history"))
+    assert set(loss.in_keys) == {*new.values(), *history}
     assert torch.equal(loss(renamed)["loss_flow_matching"], expected)
+    loss.generator.manual_seed(2)
+    assert torch.equal(loss(*(renamed[key] for key in loss.in_keys)), expected)
 
 
 def test_windows_that_do_not_fit():

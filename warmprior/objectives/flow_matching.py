@@ -15,6 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positions
+from warmprior.history import history_keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.generator import Drawing
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
@@ -166,7 +167,7 @@ class FlowMatchingLoss(Drawing, LossModule):
     def _set_in_keys(self) -> None:
         """Set ``in_keys``, when TorchRL calls it from :meth:`set_keys`."""
         k = self.tensor_keys
-        self.in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
+        self.in_keys = [k.observation, k.chunk, k.pad_mask, *history_keys(k.history)]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
