@@ -116,6 +116,10 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
     out = disturbed(HistoryObservation()(data))
     torch.testing.assert_close(out["vla_action", "chunk"], chunk)
     assert (out["history", "actions"][:2] == 1).all()
+    for generator, seed in ((actor.sampler.generator, 0), (disturbed.generator, 5)):
+        generator.manual_seed(seed)
+    *_, dispatched = disturbed(*(data[key] for key in disturbed.in_keys))
+    torch.testing.assert_close(dispatched, chunk)
     with raises(ValueError, "std"):
         HistoryShift(actor, -1.0)
     monkeypatch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())

@@ -15,7 +15,7 @@ from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
 from tests.toy_env import CountingEnv
 from warmprior import PastPrior, PreviewPrior, policy_transforms
-from warmprior.history import cold_history, window_history
+from warmprior.history import ENTRIES, cold_history, window_history
 from warmprior.lerobot import LeRobotActor
 from warmprior.lerobot.names import entry_names
 from warmprior.rl import PriorDecoder
@@ -87,7 +87,11 @@ def test_rollouts_start_from_the_mean(policy, family, prior):
         assert torch.equal(rollout["prior", "loc"][1], rollout["vla_action", "chunk"][0])
     whole, selected = actor_of(made, prior), actor_of(made, prior).select_out_keys(("vla_action", "chunk"))
     one, other = (policy(rollout.select("observation", "history")) for policy in (whole, selected))
-    assert torch.equal(one["vla_action", "chunk"], other["vla_action", "chunk"])
+    history = {f"history_{name}": rollout["history", name] for name in ENTRIES}
+    generator = torch.Generator().manual_seed(0)
+    *_, dispatched = whole(observation=rollout["observation"], **history, generator=generator)
+    for chunk in (other["vla_action", "chunk"], dispatched):
+        assert torch.equal(one["vla_action", "chunk"], chunk)
 
 
 def test_several_observations_and_the_lead_of_a_chunk(policy):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from warmprior import keys
@@ -238,8 +238,11 @@ class HistoryShift(Drawing, TensorDictModuleBase):
         super().__init__()
         check_not_negative(std=std)
         self.policy, self.std, self.generator = policy, std, generator
-        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        # What the policy sees of the last actions is made anew from the plain observation.
+        self.in_keys = [keys.OBSERVATION if key == keys.CONDITIONED else key for key in policy.in_keys]
+        self.out_keys = policy.out_keys
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Disturb the history and act."""
         history = tensordict[keys.HISTORY]

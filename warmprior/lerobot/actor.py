@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from warmprior import keys
@@ -227,6 +227,7 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         """The device of LeRobot's policy."""
         return next(self.ode.policy.parameters()).device
 
+    @dispatch(auto_batch_size=False)
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
