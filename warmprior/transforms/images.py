@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 
 from warmprior import keys
@@ -118,8 +117,7 @@ class EncodeObservation(EnvTransform):
     """
 
     def __init__(self, actor: WarmPriorActor) -> None:
-        observation_key = unravel_key(actor.observation_key)
-        super().__init__(in_keys=[observation_key], out_keys=[keys.FEATURES])
+        super().__init__(in_keys=[actor.observation_key], out_keys=[keys.FEATURES])
         if not getattr(actor.network, "encodes", False):
             raise ValueError(f"{type(actor.network).__name__} has no encoder: leave EncodeObservation out")
         self.network = copy.deepcopy(actor.network).eval().requires_grad_(False)
