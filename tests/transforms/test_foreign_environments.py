@@ -249,9 +249,10 @@ def test_a_number_and_text_are_no_observations():
     with raises(ValueError, "'observation'"):
         window_replay_buffer(data, PRIOR, batch_size=4)
     words = NonTensorStack(*["go"] * 60)
-    data = demonstrations().set("observation", TensorDict({"state": torch.zeros(60, 2), "task": words}, [60]))
-    with raises(ValueError, "'task'", "text"):
-        window_replay_buffer(data, PRIOR, batch_size=4)
+    group = TensorDict({"state": torch.zeros(60, 2), "task": words}, [60])
+    for seen, key in ((words, "'observation'"), (group, "'task'")):
+        with raises(ValueError, key, "text"):
+            window_replay_buffer(demonstrations().set("observation", seen), PRIOR, batch_size=4)
     with raises(ValueError, "'frame'", "float32"):
         window_transforms(demonstrations(), PRIOR)(TensorDict({"frame": torch.zeros(2)}, [2]))
     for name, spec in (("observation", Unbounded(())), ("task", Composite(task=NonTensor(())))):

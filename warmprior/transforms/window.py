@@ -6,8 +6,8 @@ import warnings
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor, is_tensor_collection
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Compose, Transform
@@ -129,7 +129,7 @@ def _checked(
     """Check the data, and return the observation's entries, the action and the episode numbers."""
     needed = (observation_key, keys.ACTION, keys.EPISODE)
     check_keys(data, needed, "ActionWindow", f"; the data hold {sorted(map(str, data.keys(True)))}")
-    observation, action, episode = (data.get(key) for key in needed)
+    action, episode = data.get(keys.ACTION), data.get(keys.EPISODE)
     if data.ndim != 1 or not len(data):
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
     if action.ndim != 2 or action.is_complex():
@@ -139,12 +139,9 @@ def _checked(
         )
     if not action.is_floating_point():
         action = action.to(torch.get_default_dtype())
-    observations = {observation_key: observation}
-    if is_tensor_collection(observation):
-        nested = observation.items(True, True, is_leaf=is_leaf_nontensor)
-        observations = {unravel_key((observation_key, key)): value for key, value in nested}
+    observations = dict(data.select(observation_key).items(True, True, is_leaf=is_leaf_nontensor))
     for key, value in (*observations.items(), (keys.ACTION, action)):
-        if value.ndim < 2:
+        if value.ndim < 2 or is_non_tensor(value):
             raise ValueError(
                 f"observations must be vectors or images, but {key!r} is a number or text per step: "
                 "unsqueeze it, or keep text beside the observation"
