@@ -237,7 +237,6 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         temperature = noise_factor(self.sampling.temperature)
         values = source.loc, source.sample(generator, temperature)
         loc, a0 = (chunks.scaled(value, source.warm) for value in values)
-        for key, value in zip(self.out_keys_source, (loc, source.warm, a0), strict=False):
-            tensordict.set(key, value)
+        tensordict.update({keys.LOC: loc, keys.WARM: source.warm, keys.NOISE: a0})
         padding = temperature * chunks.place(a0.reshape(-1, *a0.shape[-2:]), generator)
         return self.ode(tensordict, nfe=nfe, padding=padding)
