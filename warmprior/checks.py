@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def given(**values: Any) -> dict[str, Any]:
-    """Return the options that are not ``None``, to be checked."""
+    """Return the arguments that are not ``None``, which neither checks nor torch.compile take."""
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -126,6 +126,20 @@ def test_batch_shapes_and_whole_numbers_agree():
     assert torch.equal(loss_of(actor, whole), loss_of(actor, numbers))  # as chunks of one-hot actions
 
 
+@pytest.mark.parametrize("times", ["uniform", "u-shaped"])
+def test_the_loss_compiles_for_every_batch_size(times):
+    prior = PastPrior(H, correlation=0.5)
+    actor = actor_for(prior).replace(generator=None)
+    loss = FlowMatchingLoss(actor, times=times)
+    compiled = torch.compile(loss, backend="eager")
+    for count in (3, 5, 7):
+        data, found = sample(prior, count), []
+        for module in (loss, compiled):
+            torch.manual_seed(0)
+            found.append(module(data)["loss_flow_matching"])
+        torch.testing.assert_close(*found)
+
+
 def test_no_pad_mask_counts_everything():
     prior = PastPrior(H)
     actor, data = actor_for(prior), sample(prior, 6)

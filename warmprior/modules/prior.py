@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from warmprior.checks import check_between, check_not_negative, check_shape, check_whole_numbers
+from warmprior.checks import check_between, check_not_negative, check_shape, check_whole_numbers, given
 from warmprior.history import check_history
 from warmprior.modules.registry import Registered
 
@@ -56,9 +56,7 @@ class Source:
         PyTorch's global generator is the default.
         """
         loc = self.loc
-        like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device}
-        if generator is not None:  # torch.compile and torch.export take no argument that is None
-            like["generator"] = generator
+        like = {"dtype": loc.dtype, "device": loc.device, **given(generator=generator)}
         eps = torch.randn(loc.shape, **like)
         if self.correlation:
             common = torch.randn((*loc.shape[:-2], 1, loc.shape[-1]), **like)

@@ -9,6 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from warmprior.checks import given
+
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """A function that draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 
@@ -22,7 +24,7 @@ def uniform_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
     """Draw uniformly distributed times, as in Algorithm 1."""
-    return torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    return torch.rand(shape, dtype=dtype, device=device, **given(generator=generator))
 
 
 def u_shaped_times(
@@ -37,7 +39,7 @@ def u_shaped_times(
     .. math::
         F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
     """
-    u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    u = uniform_times(shape, generator, dtype, device)
     t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
     return t.clamp(0.0, 1.0)  # rounding may leave the interval
 
