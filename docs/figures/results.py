@@ -18,7 +18,6 @@ from pages import write
 from pandas import DataFrame, Series, concat
 from shared import (
     CORRELATED,
-    DATA,
     DOCS,
     GAUSSIAN,
     INK,
@@ -160,13 +159,8 @@ def lengths_table() -> str:
 
 
 def outcomes_by_length(runs: tuple[str, str], source: str, nfe: int) -> dict[str, np.ndarray]:
-    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of the seeds that all have.
-
-    Runs that trained fewer sources again, with another seed, are called ``_second``.
-    """
-    parts = [(run, name) for run in runs for name in (run, f"{run}_second")]
-    found = [(run, name) for run, name in parts if (DATA / f"{name}.jsonl").is_file()]
-    rows = concat([with_own_noise(read_played(name)).assign(run=run) for run, name in found])
+    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of the seeds that all have."""
+    rows = concat([with_own_noise(read_played(run)).assign(run=run) for run in runs])
     rows = rows[rows["source"].isin((source, GAUSSIAN)) & (rows["nfe"] == nfe)]
     solved = rows.pivot(index="seed", columns=["source", "run"], values="solved").dropna()
     return {s: np.stack([np.concatenate(list(solved[s, run])) for run in runs]) for s in (source, GAUSSIAN)}
