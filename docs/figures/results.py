@@ -159,7 +159,7 @@ def lengths_table() -> str:
 
 
 def outcomes_by_length(runs: tuple[str, str], source: str, nfe: int) -> dict[str, np.ndarray]:
-    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of the seeds that all have."""
+    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of their common seeds."""
     rows = concat([with_own_noise(read_played(run)).assign(run=run) for run in runs])
     rows = rows[rows["source"].isin((source, GAUSSIAN)) & (rows["nfe"] == nfe)]
     solved = rows.pivot(index="seed", columns=["source", "run"], values="solved").dropna()

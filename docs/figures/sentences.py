@@ -154,7 +154,7 @@ def sentences() -> dict[str, list[str]]:
         "which_source.md": [
             "after 80,000, two seeds, in "
             f"{whole(solved('door_80000', GAUSSIAN, 3))} and {whole(solved('door_80000', CORRELATED, 3))}",
-            f"after 80,000, one seed, {fifty_long[0]} and {fifty_long[1]} against {fifty_long[2]}",
+            f"after 80,000, two seeds, {fifty_long[0]} and {fifty_long[1]} against {fifty_long[2]}",
             f"{span(joints)}% at three steps",
             f"WP-Past and WP-Preview succeed {span(short)} points less often",
             f"the Gaussian source falls from {fall[GAUSSIAN]}% at three steps, WP-Past from {fall[PAST]}",
