@@ -118,8 +118,8 @@ def test_info_replaces_nothing_else_that_a_step_returns(name):
 
 def test_a_function_reads_info_too():
     env = gym_env(Dial())
-    env.base_env.set_info_dict_reader(lambda info, data: data.set("told", torch.tensor([len(info)])))
-    assert env.step(env.rand_action(env.reset()))["next", "told"].tolist() == [2]
+    env.base_env.set_info_dict_reader(lambda info, data: data.set("entries", torch.tensor([len(info)])))
+    assert env.step(env.rand_action(env.reset()))["next", "entries"].tolist() == [2]
 
 
 @pytest.mark.parametrize("value", [0.5, -1, float("nan"), np.array([True, False])])

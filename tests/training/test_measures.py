@@ -119,11 +119,11 @@ def test_a_fraction_is_no_success():
             evaluate(POLICY, env, episodes=2, first_seed=0, success="high")
 
 
-@pytest.mark.parametrize("told", [{}, {"measures": {"reward": "sum"}}])
-def test_a_reward_may_be_summed(told):
+@pytest.mark.parametrize("options", [{}, {"measures": {"reward": "sum"}}])
+def test_a_reward_may_be_summed(options):
     measures = {"reward": "sum"}  # the toy pays t at step t
     env = TransformedEnv(
-        Saying(), policy_transforms(PastPrior(H), observation_steps=1, success="won", **told)
+        Saying(), policy_transforms(PastPrior(H), observation_steps=1, success="won", **options)
     )
     for episode in evaluate(POLICY, env, episodes=3, first_seed=0, success="won", measures=measures):
         assert episode.measures["reward"] == sum(range(1, length(episode.seed) + 1))

@@ -78,11 +78,11 @@ def test_random_episodes(lengths, horizon, further, longer, observation_steps, n
 
 def test_episodes_that_are_too_short_for_a_warm_source_are_named():
     """The field would be trained from cold sources alone, and meet warm ones where it acts."""
-    with pytest.warns(UserWarning, match="more than 4 steps.*never warm") as told:
+    with pytest.warns(UserWarning, match="more than 4 steps.*never warm") as warned:
         warnings.simplefilter("default")
         window_replay_buffer(steps([3, 4]), PastPrior(4), batch_size=2)
         window_replay_buffer(steps([3, 4]), PastPrior(4), batch_size=3)  # as a training's second one
-    assert len(told) == 1
+    assert len(warned) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert window_replay_buffer(steps([3, 5]), PastPrior(4), batch_size=2)

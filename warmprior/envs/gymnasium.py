@@ -70,8 +70,8 @@ class _Gym(GymWrapper):
         # A reader writes over what a step returned, without a word.
         returned = {OBSERVATION, *self.observation_spec.keys(), *self.reward_keys, *self.done_keys}
         super().set_info_dict_reader(info_dict_reader, **options)
-        told = getattr(self.info_dict_reader[-1], "info_spec", {})  # a function may read as well
-        if hidden := sorted(returned & set(told.keys())):
+        written = getattr(self.info_dict_reader[-1], "info_spec", {})  # a function may read as well
+        if hidden := sorted(returned & set(written.keys())):
             raise ValueError(
                 f"the entries {hidden} of info would replace the environment's own: rename them in info, or "
                 "leave them out of success and measures"

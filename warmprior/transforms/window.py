@@ -252,7 +252,7 @@ def window_replay_buffer(
     frames = torch.arange(len(data), device=window.start.device)
     if isinstance(prior, PastPrior) and (reach := int((frames - window.start).max())) < prior.chunk_length:
         words = f"no episode has more than {reach + 1} steps, so {prior} is never warm: shorten the chunk"
-        warnings.warn(words, stacklevel=1)  # of one place: a training makes two buffers, and is told once
+        warnings.warn(words, stacklevel=1)  # from one place, so the two buffers of a training warn once
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator must be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
