@@ -18,6 +18,7 @@ from warmprior.diagnostics.flow import (
     check_not_empty,
     evaluation_mode,
     flat_windows,
+    unpadded,
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import LinearInterpolant
@@ -146,8 +147,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     if type(source) is not Source:
         raise ValueError(f"the bound needs a Gaussian source, and {prior} has another one")
     target, warm = batch.get(keys.CHUNK), source.warm
-    pad = batch.get(keys.IS_PAD, None)
-    counted = torch.ones_like(warm) if pad is None else pad.logical_not().unsqueeze(-1)
+    counted = unpadded(batch, warm)
     squared = (target - source.loc).square()
     variance = source.scale.square().expand_as(target)
     mismatch, noise = ((value * (warm & counted)).sum((-1, -2)) for value in (squared, variance))

@@ -57,9 +57,13 @@ def flat_windows(
         check_positions(keys.CHUNK, flat[keys.CHUNK], policy.prior)
     with torch.no_grad():
         source = policy.sampler.source(flat)
-    pad = flat.get(keys.IS_PAD, None)
-    counted = torch.ones_like(source.warm) if pad is None else pad.logical_not().unsqueeze(-1)
-    return flat.update({keys.LOC: source.loc, keys.WARM: source.warm, "counted": counted})
+    return flat.update({keys.LOC: source.loc, keys.WARM: source.warm, "counted": unpadded(flat, source.warm)})
+
+
+def unpadded(windows: TensorDictBase, warm: Tensor) -> Tensor:
+    """Return True at the positions that are not padding, bool ``[*B, P, 1]`` like `warm`."""
+    pad = windows.get(keys.IS_PAD, None)
+    return torch.ones_like(warm) if pad is None else pad.logical_not().unsqueeze(-1)
 
 
 def check_not_empty(batch: TensorDictBase) -> None:
