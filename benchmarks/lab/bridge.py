@@ -108,7 +108,13 @@ class BridgeCoupling(OTCoupling):
         row = cost.new_zeros(len(cost), 1)
         for k in range(halvings, -1, -1):
             now = noise * 2**k
-            for _ in range(self.ROUNDS if k else 5 * self.ROUNDS):
-                column = -now * ((row - cost) / now).logsumexp(0, keepdim=True)
-                row = -now * ((column - cost) / now).logsumexp(1, keepdim=True)
+            # The first round at a noise takes logarithms, which cannot underflow; the others are products.
+            column = -now * ((row - cost) / now).logsumexp(0, keepdim=True)
+            row = -now * ((column - cost) / now).logsumexp(1, keepdim=True)
+            plan = ((row + column - cost) / now).exp()
+            u = torch.ones_like(row)
+            for _ in range((self.ROUNDS if k else 5 * self.ROUNDS) - 1):
+                v = 1 / (u.mT @ plan)
+                u = 1 / (plan @ v.mT)
+            column, row = column + now * v.log(), row + now * u.log()
         return torch.multinomial(((column - cost) / noise).softmax(1), 1).squeeze(1)
