@@ -10,10 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.envs import SerialEnv, TransformedEnv
 
 from tests.errors import raises
-from tests.toy_env import mlp_actor, stirred
-from warmprior import GaussianPrior, HistoryObservation, PastPrior, keys
+from tests.toy_env import ACTION_DIM, CountingEnv, mlp_actor, stirred
+from warmprior import ChunkStep, GaussianPrior, HistoryObservation, PastPrior, keys
 from warmprior.diagnostics import executed_actions, smoothness
 from warmprior.diagnostics.leaks import HistoryShift
 from warmprior.history import cold_history
@@ -82,6 +83,18 @@ def test_rows_of_a_collector_may_be_joined(decisions):
         return
     one, other = smoothness(rollout), smoothness(rollout.reshape(-1))
     assert vars(one) == pytest.approx(vars(other), nan_ok=True)
+
+
+def test_decisions_that_a_rollout_repeats_in_ended_rows_count_once():
+    env = TransformedEnv(SerialEnv(2, [lambda: CountingEnv(7), lambda: CountingEnv(20)]), ChunkStep(4))
+    rollout = env.rollout(9, break_when_any_done=False, break_when_all_done=True)
+    assert rollout["next", "done"][0].sum() > 1  # the short row's last decision is repeated
+    executed, decision, _ = executed_actions(rollout)
+    short, long = rollout["vla_action", "chunk"].unbind(0)
+    expected = torch.full((20, ACTION_DIM), math.nan)
+    expected[:7] = torch.cat([short[0], short[1, :3]])
+    torch.testing.assert_close(executed, torch.stack([expected, long.flatten(0, 1)]), equal_nan=True)
+    assert (decision[0, 7:] == -1).all()
 
 
 def test_bad_rollouts_are_named():

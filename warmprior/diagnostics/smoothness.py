@@ -49,7 +49,8 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         rollout: decisions ``[*B, D]``, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside, ``("next", "done")``;
             if chunks take effect late, also the delay that :class:`InferenceDelay` writes. Rows of a
-            collector may be joined, since it numbers episodes.
+            collector may be joined, since it numbers episodes. Decisions that ``break_when_all_done`` repeats
+            in ended rows are left out.
 
     Returns:
         The actions ``[*B, T, d_a]``, padded with NaN where a row executed fewer than the longest; the index
@@ -84,6 +85,9 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     delay = rollout.get(keys.DELAY, None)
     if delay is not None:  # actions before a chunk took effect belong to the decision before
         decision = decision - (position < delay).long()
+    # TorchRL's `break_when_all_done` repeats an ended row's last decision until the longest row ends.
+    repeats = done[..., 1:, :] & done[..., :-1, :] & (chunk.diff(dim=-3) == 0).all(-1).all(-1, True)
+    kept[..., 1:, :] &= ~repeats
     ended = done.squeeze(-1).clone()
     if (number := rollout.get(("collector", "traj_ids"), None)) is not None:  # rows may have been joined
         ended[..., :-1] |= number.reshape(ended.shape).diff(dim=-1) != 0
