@@ -64,6 +64,7 @@ class Policy:
     run: Run  # the run, with an absolute folder
     grid: str
     name: str = ""  # name of its folder
+    identity: str = ""  # digest of its demonstrations
     facts: dict[str, Any] = field(default_factory=dict, compare=False)  # columns of all its rows
 
     @property
@@ -84,8 +85,14 @@ class Policy:
         return self.folder / "status.json"
 
     def task(self) -> Task:
-        """Return its task, which is read once per process."""
-        return cached_task(self.data, *self.place)
+        """Return its task, read once per process; raise ValueError if it has other demonstrations."""
+        task = cached_task(self.data, *self.place)
+        if task.identity != self.identity:
+            raise ValueError(
+                f"the demonstrations of {title_of(task)} are others than when the run began: leave their "
+                "files unchanged, and draw random ones with a seed"
+            )
+        return task
 
     def teacher(self) -> Policy | None:
         method = self.method.teacher
@@ -178,7 +185,7 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
         "seed": like.training.seed,
         "iterations": like.training.iterations,
     }
-    return replace(like, method=method, name=name, facts={**facts, "policy": name})
+    return replace(like, method=method, name=name, identity=task.identity, facts={**facts, "policy": name})
 
 
 def slug(text: str) -> str:

@@ -1,6 +1,7 @@
 """A task of a user's own whose comparisons take seconds."""
 
 from dataclasses import replace
+from itertools import count
 
 import torch
 from tensordict import TensorDict
@@ -58,6 +59,14 @@ def task(options=None, seed=0):
     """Named as ``--task tests.benchmarks.drift:task``."""
     ends = {"success": "solved", "measures": {"side": "max"}}
     return Task.of("drift", demonstrations(seed), DriftEnv, style="own", **ends)
+
+
+drawn = count()
+
+
+def unseeded(options):
+    """With other demonstrations each time they are read."""
+    return task(options, seed=next(drawn))
 
 
 def other(options):

@@ -9,6 +9,7 @@ from torchrl.envs import TransformedEnv
 from lab import jobs
 from lab import policies as common
 from lab.command_line import parse
+from lab.measures import measure
 from lab.policies import Cell, play
 from lab.presets import PRESETS
 from tests.benchmarks import drift
@@ -132,6 +133,20 @@ def test_equal_policies_are_shared_and_others_are_not(tmp_path, capsys):
     others = {"sigma": 0.4, "batch_size": 8, "hidden_dim": 8, "prior": "past,correlation=0.5"}
     others["task"] = f"{drift.__name__}:other"
     assert not any(exists(**{name: value}) for name, value in others.items())
+
+
+@pytest.mark.parametrize("work", [common.train, lambda policy: measure(policy, [1])])
+def test_a_worker_that_reads_other_demonstrations_says_so(work, tmp_path):
+    """Its policy would be named after those that the first process read."""
+    (policy,) = policies_of(
+        arguments(tmp_path / "out", task=f"{drift.__name__}:unseeded", prior="past", seeds=1)
+    )
+    if work is not common.train:
+        common.train(policy)
+    common.cached_task.cache_clear()  # as in a fresh process
+    with raises(ValueError, "drift own", "seed"):
+        work(policy)
+    assert work is not common.train or not policy.is_trained
 
 
 LEARNT = ("forecast", "step", "cvae", "a2a", "leap")
