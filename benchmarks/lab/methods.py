@@ -151,7 +151,8 @@ METHODS: dict[str, Composition] = {
     "leap": Composition("LeaP", "#b8a9c9", LeapPrior),
 }
 
-OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf"]
+PACKAGES = ("warmprior", "torch", "builtins")  # their code is not the user's own
+OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3"]
 
 
 def composition(name: str) -> Composition:
@@ -175,11 +176,13 @@ def label(name: str, options: str = "") -> str:
     return ", ".join(filter(None, (METHODS[name].label if name in METHODS else name, options)))
 
 
-def color(name: str) -> str:
-    """Return the colour of a method in figures; a user's own prior gets one by its name."""
+def color(name: str, taken: Sequence[str] = ()) -> str:
+    """Return the colour of a method in figures; a user's own prior gets a free one, by its name."""
     if name in METHODS:
         return METHODS[name].color
-    return OWN_COLORS[zlib.crc32(name.encode()) % len(OWN_COLORS)]
+    first = zlib.crc32(name.encode()) % len(OWN_COLORS)
+    order = OWN_COLORS[first:] + OWN_COLORS[:first]
+    return next((one for one in order if one not in taken), order[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,9 +252,10 @@ class Method:
         """Return everything that makes it differ from other methods, as JSON."""
         config = {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
         if self.text.partition(",")[0] not in METHODS:
-            # A policy is trained again when a user edits their own prior.
-            file = inspect.getfile(self.parts.prior)
-            config["code"] = digest_of(Path(file).read_text(encoding="utf-8"))
+            # A policy is trained again when a user edits their own prior, or a class that it builds on.
+            kinds = [k for k in self.parts.prior.__mro__ if k.__module__.partition(".")[0] not in PACKAGES]
+            files = dict.fromkeys(map(inspect.getfile, kinds))
+            config["code"] = digest_of(*(Path(file).read_text(encoding="utf-8") for file in files))
         return config
 
     @property

@@ -70,8 +70,10 @@ def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = Fal
 def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
     """Return the colour of each method: its prior's, in paler shades for methods with options."""
     colors: dict[Hashable, Any] = {}
+    taken: list[str] = []
     for prior, group in rows.groupby("prior", sort=False):
-        base, methods = to_rgb(color(prior)), sorted(group["method"].unique(), key=lambda name: "," in name)
+        taken.append(color(prior, taken))
+        base, methods = to_rgb(taken[-1]), sorted(group["method"].unique(), key=lambda name: "," in name)
         end = float(sum(base) < 2)
         for place, method in enumerate(methods):
             share = PALEST * place / max(1, len(methods) - 1)
@@ -212,7 +214,8 @@ def plot_learning_curves(
         right.errorbar(rates.mean().index, rates.mean(), yerr=rates.std().fillna(0.0), **look)
     left.set_yscale("log")
     dress(left, x="iteration", y="flow-matching loss (own source)")
-    dress(right, x="iteration", y=f"success rate (NFE {rows['nfe'].iloc[0]})", rate=True)
+    nfes = ", ".join(map(str, rows["nfe"].unique()))  # a method may have its own
+    dress(right, x="iteration", y=f"success rate (NFE {nfes})", rate=True)
     right.set_xlim(left.get_xlim())
     save(figure, path, title)
 

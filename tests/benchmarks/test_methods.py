@@ -34,8 +34,13 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     code = "from warmprior import PastPrior\nclass Mine(PastPrior):\n    name = 'mine'\n"
     file.write_text(code)
     one, same = (Method("edited_prior:Mine", H).config() for _ in range(2))
+    (tmp_path / "built_on_it.py").write_text(
+        "import edited_prior\nclass More(edited_prior.Mine):\n    name = 'more'\n"
+    )
+    built = Method("built_on_it:More", H).config()
     file.write_text(code + "    default_sigma = 0.05\n")
     assert one == same != Method("edited_prior:Mine", H).config()
+    assert built != Method("built_on_it:More", H).config()
 
 
 def test_a_temperature_that_is_named_twice_is_played_once():

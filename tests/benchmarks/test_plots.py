@@ -54,6 +54,14 @@ def test_violins_and_bars_show_what_the_seeds_of_a_method_have_in_common(tmp_pat
     assert [text.xy[1] for text in axis.texts] == pytest.approx([0.6, 0.9, 0.5, 1.0])
 
 
+def test_priors_of_ones_own_have_colours_of_their_own():
+    names = ["anchor", "damped", "last", "mean", "slow", "fast", "mine"]
+    rows = pd.DataFrame([row(prior=name, sigma=1.0) for name in names])
+    assert len(set(plots.colors_of(labelled(rows)).values())) == 7
+    (first, *_), (alone,) = (plots.colors_of(labelled(part)).values() for part in (rows, rows[:1]))
+    assert first == alone  # by its name, whatever it is compared with
+
+
 def test_lines_have_a_panel_per_measure_and_column(tmp_path, figures):
     options = {"": 2, "correlation=0.5": 8}
     rows = [
