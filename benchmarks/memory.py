@@ -14,9 +14,11 @@ from pathlib import Path
 import pandas as pd
 
 from lab.command_line import script
+from lab.options import Options
 from lab.plots import colors_of, new_figure, save
 from lab.report import summary, table
 from lab.rows import PLAYED, read_rows
+from lab.stored_options import stored_options
 
 
 @script("memory.py", hint="")
@@ -30,11 +32,14 @@ def main(argv: list[str] | None) -> None:
 
     # A row per setting, method and NFE.
     whose = "robomimic.py or pusht.py: name a run of these"
-    tables = [pd.DataFrame(read_rows(run / "results.jsonl", PLAYED, whose)) for run in args.runs]
-    for run, rows in zip(args.runs, tables, strict=True):
+    summaries = []
+    for run in args.runs:
+        rows = pd.DataFrame(read_rows(run / "results.jsonl", PLAYED, whose))
         if "memory_gain" not in rows:
             raise ValueError(f"{run} measured no memory_gain: name a run of robomimic.py or pusht.py")
-    summaries = [summary(rows, top_k=1).assign(iterations=rows["iterations"].max()) for rows in tables]
+        top_k = stored_options(Options, run, None).evaluation.top_k  # as in the run's report
+        for iterations, part in rows.groupby("iterations"):
+            summaries.append(summary(part, top_k).assign(iterations=iterations))
     gains = pd.concat(summaries)
     gains = gains[gains.memory_gain.notna() & gains.gain.notna()]
     if gains.empty:

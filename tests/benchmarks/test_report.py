@@ -10,7 +10,9 @@ import pytest
 from scipy import integrate, stats
 
 from lab import report
+from lab.command_line import parse, started
 from lab.files import PartialFailure
+from lab.presets import PRESETS
 from tests.benchmarks.script_parts import is_png
 from tests.errors import raises
 from tests.paper_facts import SIGMA_SUCCESS, SUCCESS
@@ -154,8 +156,14 @@ def test_the_report_has_the_layout_of_table_1():
     assert text.startswith(f"| Success rate (%) | {columns} |")
     assert cells_of(text, "Square-PH, measured (scr") == ["50.0", "**80.0** (+30.0*)", "50.0 (+0.0)"]
     assert cells_of(text, "Square-PH, paper") == [f"{rate}" for rate in SUCCESS["square", "ph", "state"][-3:]]
-    counts = [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
-    assert counts == [("-", "-", "-"), ("9", "0", "1.00"), ("1", "1", "0.50")]
+
+    def counts(text):
+        return [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
+
+    assert counts(text) == [("-", "-", "-"), ("9", "0", "1.00"), ("1", "1", "0.50")]
+    # An episode that one of two checkpoints solves counts half.
+    halves = pd.DataFrame([row("01"), row("11", prior="past"), row("01", prior="past", checkpoint=50)])
+    assert counts(table(halves, 2))[1] == ("0.5", "0", "0.65")  # 1 - 2^-1.5
     assert "3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed" in text
     assert "- A note.\n" in text and "source_leak" not in text  # nobody measured it
 
@@ -226,16 +234,24 @@ def test_a_training_is_shown_by_its_best_checkpoints():
 
 
 def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
+    """A success is that of the run's own --top-k, and trainings of other lengths have their own lines."""
     one = [row(5, memory_gain=0.0), row(8, prior="past", memory_gain=0.25)]
+    one.append(row(6, prior="past", checkpoint=50, memory_gain=None))
+    one += [row(2, iterations=200), row(9, prior="past", iterations=200, memory_gain=0.5)]
     # The first method has no gain, and what was not measured no point.
     two = [row(5, task="can", memory_gain=0.0), row(8, task="can", prior="past", memory_gain=None)]
     for name, rows in (("one", one), ("two", two)):
-        (tmp_path / name).mkdir()
+        with started(parse(PRESETS, ["--out", str(tmp_path / name), "--top-k", "2"], "robomimic", None), ""):
+            pass
         (tmp_path / name / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     argv = [str(tmp_path / name) for name in ("one", "two")]
     assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert lines[2:] == ["| Square-PH | 1 | 1 | WP-Past | 0.250 | +30.0% |"] and is_png(tmp_path / "a.png")
+    assert lines[2:] == [
+        "| Square-PH | 100 | 1 | 1 | WP-Past | 0.250 | +20.0% |",  # the mean of 8 and 6 of 10, minus 5
+        "| Square-PH | 200 | 1 | 1 | WP-Past | 0.500 | +70.0% |",
+    ]
+    assert is_png(tmp_path / "a.png")
     assert memory.main([str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.endswith("results.jsonl: no such file\n")
     (tmp_path / "one" / "results.jsonl").write_text('{"task": "navigation"}\n')
