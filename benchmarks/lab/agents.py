@@ -16,7 +16,7 @@ from lab.comparison import train_all
 from lab.methods import ColdPrior, Method
 from lab.options import FinishedRun, Options, check_given, check_single
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors
-from lab.tasks import check_counts, check_network
+from lab.tasks import check_counts
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
@@ -113,9 +113,7 @@ class AgentsOptions(Options):
             raise ValueError("episodes of the toy have one length: leave out --horizon and --play-on")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
-        if not self.is_toy and self.policies is None:
-            self.data.check()
-            check_network(self.network, self.data)
+        super().check()
         for method in self.sources.methods():
             if not method.is_flow:
                 raise ValueError(

@@ -182,6 +182,8 @@ class DataOptions:
                     f"--demonstrations takes one number with --dataset, got {self.demonstrations}"
                 )
             check_place(self.dataset, "--dataset")
+        if len(self.data) > 1 and self.task and not any(map(is_simulated, self.task)):
+            raise ValueError(f"a task of your own has one style: name one --data, got {' '.join(self.data)}")
         for task in filter(is_simulated, self.task):
             get_task(task)
             if self.generated and task not in EXPERTS:
