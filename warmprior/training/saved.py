@@ -51,7 +51,7 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if (folder / CONFIG).is_file():
         copy = read_json(folder / CONFIG)
         _check_format(folder / CONFIG, copy)  # a policy of another format may have no configuration elsewhere
-    tensors, config = load_state(path, "policy", "Copy it again")
+    tensors, config = load_state(path, "policy", "Copy it again, or remove it to train again")
     _check_format(path, config)
     if copy not in (None, config):
         differ = sorted(name for name in {*copy, *config} if copy.get(name) != config.get(name))
