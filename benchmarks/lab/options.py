@@ -25,7 +25,7 @@ from lab.tasks import (
 )
 from warmprior.data.opening import name_of_place
 from warmprior.io.distributed import check_batch, launched
-from warmprior.modules.ode import Sampling, check_grid
+from warmprior.modules.ode import Sampling, jump_of
 from warmprior.training import NetworkOptions, TrainingConfig
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
@@ -81,7 +81,7 @@ class Evaluation:
         check_given(self, "nfe", "temperature")
         for temperature in self.temperature:
             Sampling(temperature=temperature)
-        check_grid(self.grid)
+        jump_of(self.grid)
 
     @property
     def environment(self) -> dict[str, Any]:

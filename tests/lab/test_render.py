@@ -180,7 +180,7 @@ def not_a_number(file):
 
 @pytest.mark.parametrize(
     ("change", "facts"),
-    [(not_a_number, ("NaN", "row 2")), (of_another_environment, ("(4, 45)", "Lift", "(4, 32)"))],
+    [(not_a_number, ("nan", "row 2")), (of_another_environment, ("(4, 45)", "Lift", "(4, 32)"))],
 )
 def test_states_that_cannot_be_rendered_are_refused(copy, change, facts):
     with h5py.File(copy, "a") as file:

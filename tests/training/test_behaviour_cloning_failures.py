@@ -79,7 +79,7 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
         return out
 
     cloning.update.loss_module.forward = broken
-    with raises(FloatingPointError, "loss", "nan", "state.safetensors"):
+    with raises(FloatingPointError, "the loss", "NaN", "state.safetensors"):
         cloning.run()
     tensors, facts = load_state(tmp_path / "state.safetensors")
     assert facts["iteration"] < bad

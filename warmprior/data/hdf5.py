@@ -400,9 +400,6 @@ class RobomimicReader(DemonstrationReader):
         if dataset is None and key == "rewards":
             out[...] = 0
             return
-        if dataset is None:
-            present = names(self.file[f"data/{demo}"])
-            raise unknown(f"{self.file.filename}: data/{demo}", "dataset", key, present)
         what = f"{self.name(demo, key)} (shape {dataset.shape})"
         for start in range(0, len(out), BLOCK):
             rows = out[start : start + BLOCK]

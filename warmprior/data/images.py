@@ -12,7 +12,7 @@ import numpy as np
 from warmprior.data.hdf5 import read_origin
 from warmprior.data.lerobot_index import LeRobotIndex
 from warmprior.data.opening import Demonstrations
-from warmprior.data.replay import DatasetError, DatasetIndex
+from warmprior.data.replay import DatasetError, DatasetIndex, store_finite
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer
 from warmprior.envs.simulator import make_simulator, scene_stays
@@ -53,9 +53,7 @@ class StateRenderer:
         if states.shape != expected:
             name = self.index.env_args["env_name"]
             raise DatasetError(f"{what} has shape {states.shape}, but the simulator of {name} has {expected}")
-        usable = np.isfinite(states).all(-1)
-        if not usable.all():  # MuJoCo would render such states without an error
-            raise DatasetError(f"{what} has NaN or infinity in row {np.argmin(usable)}: leave the demo out")
+        store_finite(states, states, what, "Leave the demo out.")  # MuJoCo would render NaN without an error
         return states[:, 1 : 1 + model.nq]
 
     def compare(self, state: Sequence[float], images: Mapping[str, np.ndarray], advice: str) -> None:

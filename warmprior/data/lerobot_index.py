@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise, product
 from pathlib import Path
-from string import Formatter
 from typing import Any
 
 from warmprior.data.replay import (
@@ -19,6 +18,7 @@ from warmprior.data.replay import (
     common_size,
     declared_poses,
     pose_keys,
+    reading,
     unknown,
 )
 from warmprior.envs.tasks import TaskSpec, task_of_env
@@ -125,10 +125,8 @@ def _metadata(root: Path) -> Any:
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
     again = "Copy, download, record or convert it again."
-    try:
+    with reading(f"{root}: LeRobot's meta/", again):
         version = _check_info(read_json(root / "meta" / "info.json"))
-    except ValueError as error:
-        raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     if version != LEROBOT_VERSION:
         raise DatasetError(
             f"{root} is a LeRobotDataset {version}, but {LEROBOT_VERSION} is needed: convert v2.1 with "
@@ -137,10 +135,8 @@ def _metadata(root: Path) -> Any:
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
         if not any(root.glob(pattern)):  # LeRobot would look for it on the hub
             raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
-    try:
+    with reading(f"{root}: LeRobot's meta/", again):
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
-    except Exception as error:  # json, pyarrow, datasets and LeRobot raise different errors
-        raise DatasetError(f"{root}: LeRobot cannot read its meta/ ({error}). {again}") from error
     whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
     _check_columns(root, metadata, whole)
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
@@ -153,20 +149,8 @@ def _metadata(root: Path) -> Any:
     return metadata
 
 
-_PLACES = {
-    "data_path": ("chunk_index", "file_index"),
-    "video_path": ("video_key", "chunk_index", "file_index"),
-}
-
-
-def _is_template(path: str, fields: Sequence[str]) -> bool:
-    """Return True if a text is a path with only these fields: a format could expand to any length."""
-    try:
-        places = [part[1:] for part in Formatter().parse(path) if part[1] is not None]
-    except ValueError:
-        return False
-    plain = re.compile(r"(0?\d{1,2}d?)?")
-    return all(field in fields and not how and plain.fullmatch(spec or "") for field, spec, how in places)
+_TEMPLATE = re.compile(r"([^{}]|\{(video_key|chunk_index|file_index)(:0?\d{1,2}d?)?\})*")
+"""Paths with these fields and plain formats only: others could expand to any length."""
 
 
 def _check_info(info: Any) -> str:
@@ -190,9 +174,9 @@ def _check_info(info: Any) -> str:
         for part, kinds in {"names": (list, dict), "info": (dict,), "video_info": (dict,)}.items():
             value = feature.get(part)
             need(f"features.{name}.{part}", value, value is None or isinstance(value, kinds))
-    for name, fields in _PLACES.items():
+    for name in ("data_path", "video_path"):
         if (path := info.get(name)) is not None:  # LeRobot's own by default
-            need(name, path, isinstance(path, str) and _is_template(path, fields))
+            need(name, path, isinstance(path, str) and _TEMPLATE.fullmatch(path) is not None)
     return version
 
 
@@ -340,10 +324,8 @@ def _description(root: Path) -> dict[str, Any]:
     path = root / DESCRIPTION
     if not path.exists():
         return {}
-    try:
+    with reading(f"{path}", "Convert the file again."):
         description = read_json(path)
-    except ValueError as error:
-        raise DatasetError(f"{error}. Convert the file again.") from error
     if not (isinstance(description, dict) and description.get("format") == 1):
         raise DatasetError(f"{path} is from another version: convert the file again, or remove it")
     observations, masks = description.get("observations"), description.get("masks", {})

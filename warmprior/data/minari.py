@@ -44,10 +44,7 @@ def load_minari(name: str) -> Any:
     try:
         return minari.load_dataset(name, download=True)
     except Exception as error:
-        here = (
-            minari.dataset.minari_dataset.__dict__.get("get_dataset_path") or minari.storage.get_dataset_path
-        )
-        folder = Path(here(name))
+        folder = Path(minari.storage.get_dataset_path(name))
         if (folder / "data").exists():
             raise DatasetError(
                 f"{folder}: not a readable Minari dataset ({error}): download it again"

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from warmprior.data.hdf5 import member, open_robomimic, read_described, reading, selected_demos
-from warmprior.data.replay import DatasetError, check_count, check_env_args
+from warmprior.data.replay import DatasetError, check_count, check_env_args, store_finite
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.simulator import make_simulator, scene_stays
@@ -134,9 +134,7 @@ def _write_demo(source: Any, name: str, demo: Any, loop: StepLoop) -> int:
             f"{env} with this robot has [N, {widths[0]}] and [N, {widths[1]}]: they are from another robot"
         )
     for key, value in arrays.items():
-        if not np.isfinite(value).all():
-            row = int(np.argmin(np.isfinite(value).all(-1)))
-            raise DatasetError(f"{source.filename}: data/{name}/{key} has NaN or infinity in row {row}")
+        store_finite(value, value, f"{source.filename}: data/{name}/{key}", "Remove the demo.")
     observed, solved = zip(*_observed(states, loop), strict=True)
     rewards = np.array([*solved[1:], solved[-1]], np.float64)
     dones = rewards.astype(np.int64)

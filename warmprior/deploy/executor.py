@@ -132,10 +132,8 @@ class AsyncExecutor:
         execute = usual_execute(plain, prior, expected) if execute is None else execute
         check_delay(expected, execute, length)
         check_between(1, prior.chunk_length, execute=execute)
-        if normalizer is not None and keys.ACTION not in normalizer.keys:
-            raise ValueError(
-                f"the normaliser has {normalizer.keys}, but no {keys.ACTION!r}: fit it with that key"
-            )
+        if normalizer is not None:
+            normalizer.check_has(keys.ACTION)
         self.prior, self.execute, self.timeout, self.latency = prior, execute, timeout, latency
         self.actor = actor.eval()
         self._shape = (length, action_dim)
@@ -263,9 +261,7 @@ class AsyncExecutor:
         data = data.clone()
         if self._sees_history:
             data = HistoryObservation()(data)
-        chunk = self.actor(data.to(self._device)).get(keys.CHUNK)
-        if chunk is None:
-            raise ValueError(f"the policy wrote no chunk at {keys.CHUNK}")
+        chunk = self.actor(data.to(self._device))[keys.CHUNK]
         check_shape("the policy's chunk", chunk, self._shape)
         check_finite({"the policy's chunk": chunk}, "it is not executed")
         return chunk.to(self._chunk)

@@ -62,11 +62,7 @@ class RobotObservation:
         if normalizer is None or shapes is None:
             return
         vectors: list[Any] = [(keys.OBSERVATION, name) for name, shape in shapes.items() if len(shape) == 1]
-        needed = [keys.OBSERVATION] if self._vector else vectors
-        if lacking := [key for key in needed if key not in normalizer.keys]:
-            raise ValueError(
-                f"the normaliser has {normalizer.keys}, but not {lacking}: fit it with these keys"
-            )
+        normalizer.check_has(*[keys.OBSERVATION] if self._vector else vectors)
 
     def __call__(self, observation: Any) -> Tensor | TensorDictBase:
         """Return the observation of one step, ``[d]`` or a tensordict ``[]``.

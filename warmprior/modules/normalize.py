@@ -187,6 +187,11 @@ class Normalizer(RawUnits):
         """Return half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
         return self.get_buffer(_name(key, "scale"))
 
+    def check_has(self, *needed: NestedKey) -> None:
+        """Raise ValueError if the normaliser was not fitted to one of these keys."""
+        if lacking := [key for key in needed if key not in self.keys]:
+            raise ValueError(f"the normaliser has {self.keys}, but not {lacking}: fit it to data with them")
+
     def normalize(self, data: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy in which the keys that are present are normalised."""
         data = data.clone(False)

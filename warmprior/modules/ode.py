@@ -29,11 +29,6 @@ JUMP = 0.5
 """The end of the dense steps of ``dense-jump``; Chen et al. saw fields pull to training actions after it."""
 
 
-def check_grid(grid: str) -> None:
-    """Raise ValueError if no grid has this name, or its jump does not start in (0, 1)."""
-    _jump(grid)
-
-
 def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[float, float, int]]:
     """Return the parts of a grid as (begin, end, number of steps), each with steps of equal length.
 
@@ -43,22 +38,22 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
       the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
       ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
 
-    A single step is the same on every grid. Raises ValueError as :func:`check_grid` does.
+    A single step is the same on every grid. Raises ValueError as :func:`jump_of` does.
 
     Examples:
         >>> from warmprior.modules.ode import grid_parts
         >>> grid_parts("dense-jump:0.75", 4), grid_parts("dense-jump", 1)
         ([(0.0, 0.75, 3), (0.75, 1.0, 1)], [(0.0, 1.0, 1)])
     """
-    share = _jump(grid)
+    share = jump_of(grid)
     if share is None or steps == 1:
         return [(start_time, 1.0, steps)]
     jump = start_time + share * (1.0 - start_time)
     return [(start_time, jump, steps - 1), (jump, 1.0, 1)]
 
 
-def _jump(grid: str) -> float | None:
-    """Return the share of the way before the jump, or ``None`` without a jump."""
+def jump_of(grid: str) -> float | None:
+    """Return the share of the way before a grid's jump, or ``None`` without one."""
     if grid == "uniform":
         return None
     name, colon, number = str(grid).partition(":")
@@ -205,7 +200,7 @@ class Sampling:
     def __post_init__(self) -> None:
         check_whole_numbers(**given(nfe=self.nfe, max_nfe=self.max_nfe))
         self.evaluations()
-        check_grid(self.grid)
+        jump_of(self.grid)
         if isinstance(self.clip, Sequence):
             object.__setattr__(self, "clip", tuple(self.clip))
             if not (self.clip and all(bound >= 0 for bound in self.clip)):

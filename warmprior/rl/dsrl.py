@@ -25,6 +25,7 @@ from warmprior.checks import (
     check_finite_numbers,
     check_keys,
     check_positive,
+    check_shape,
     check_whole_numbers,
 )
 from warmprior.rl.decoder import PriorDecoder, ResidualSampler
@@ -328,10 +329,8 @@ class DSRLNALoss(LossModule):
 
     def _values(self, data: TensorDictBase) -> Tensor:
         key = self.tensor_keys.state_action_value
-        values = data.get(key, None)
-        if values is None or values.shape[-1:] != (1,):
-            shape = "none" if values is None else f"the shape {tuple(values.shape)}"
-            raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {shape}")
+        values = data[key]
+        check_shape(f"a critic's {key!r}", values, (*values.shape[:-1], 1))
         return values.squeeze(-1)
 
     def _finish(

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
 
+from warmprior.checks import check_finite
 from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
@@ -27,7 +28,6 @@ from warmprior.training.checkpoint import (
     named,
     part_identity,
     restore_rng,
-    restoring,
     rng_tensors,
     select,
 )
@@ -240,17 +240,10 @@ class BehaviourCloning:
 
     def _check_finite(self) -> None:
         # Checked before every save, and not only before logs: a run cannot resume from a saved NaN.
-        losses = torch.stack(self._running)
-        finite = bool(torch.isfinite(losses).all())
-        if finite and all(bool(torch.isfinite(p).all()) for p in self.update.trained.parameters()):
-            return
-        what = "the weights became NaN or infinite"
-        if not finite:
-            what = f"the loss became {losses[~torch.isfinite(losses)][0].item()}"
         saved = f"; the last good state is {self.state_path}" if self.state_path.exists() else ""
-        raise FloatingPointError(
-            f"{what} at or before iteration {self.iteration}{saved}. Lower the learning rate or check the "
-            "data."
+        check_finite(
+            {"the loss": torch.stack(self._running), **dict(self.update.trained.named_parameters())},
+            f"at or before iteration {self.iteration}{saved}. Lower the learning rate or check the data",
         )
 
     def _log(self, loss: float, bar: Any) -> None:
@@ -291,7 +284,7 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
-        self._state.restore(restoring(self.state_path)(self._load))
+        self._state.restore(self._load)
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
         self.iteration = facts["iteration"]

@@ -64,7 +64,8 @@ class RunState:
             return
         tensors, facts = load_state(self.path)
         check_identity(self.path, facts.get("identity"), self.identity)
-        load(tensors, facts)
+        with restoring(self.path):
+            load(tensors, facts)
         self._known = written
 
 

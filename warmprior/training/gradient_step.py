@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+from torch.optim.lr_scheduler import LambdaLR
 
 from warmprior import keys
 from warmprior.io.distributed import world_size
@@ -134,11 +135,7 @@ class GradientStep:
         restore_module(self.trained, select("trained", tensors))
         restore_module(self.ema, select("ema", tensors))
         restore_optimizer(self.optimizer, select("optimizer", tensors))
-        schedule = self.schedule
-        schedule.last_epoch = iteration
-        rates = zip(self.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True)
-        for group, base, factor in rates:
-            group["lr"] = base * factor(iteration)
+        self.schedule = LambdaLR(self.optimizer, self.schedule.lr_lambdas, last_epoch=iteration - 1)
 
 
 class _Scalar(nn.Module):

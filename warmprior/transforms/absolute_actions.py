@@ -83,12 +83,7 @@ class AbsoluteActions(EnvTransform):
         return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        pose = observed(tensordict, keys.EEF_POSE)
-        if pose is None:
-            raise KeyError(
-                f"AbsoluteActions needs the gripper's pose at {keys.EEF_POSE!r}: step with what reset or "
-                "step_mdp returned"
-            )
+        pose = observed(tensordict, keys.EEF_POSE, "AbsoluteActions")
         action = tensordict.get(keys.ACTION)
         return tensordict.set(keys.ACTION, self.delta(action, pose))
 

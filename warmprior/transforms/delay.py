@@ -120,10 +120,9 @@ class InferenceDelay(EnvTransform):
         self.execute = execute
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        needed = (*self.in_keys, keys.DELAY)
-        check_keys(tensordict, needed, "InferenceDelay", ". Step from the last reset's or step's tensordict")
-        if tensordict.get(self.chunk_key, None) is None:
-            return tensordict  # ChunkStep raises
+        needed = (*self.in_keys, keys.DELAY, self.chunk_key)
+        hint = ". Step with the chunk, from the last reset's or step's tensordict"
+        check_keys(tensordict, needed, "InferenceDelay", hint)
         executed = executed_chunk(tensordict, self.chunk_key, self.history_key)
         return tensordict.set(self.chunk_key, executed)
 

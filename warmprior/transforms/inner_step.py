@@ -13,6 +13,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
+from warmprior.checks import check_keys
 from warmprior.transforms.restarts import NATIVE, Restarts
 
 KEPT = "_kept"
@@ -159,11 +160,12 @@ def set_aside(tensordict: TensorDictBase, observed: Mapping[NestedKey, TensorSpe
             tensordict.del_(key)
 
 
-def observed(tensordict: TensorDictBase, key: NestedKey) -> Any:
-    """Return an observation in a step's input, possibly :func:`set_aside`, or ``None`` if there is none."""
+def observed(tensordict: TensorDictBase, key: NestedKey, whose: str) -> Any:
+    """Return an observation in a step's input, possibly :func:`set_aside`; raise KeyError without one."""
     kept = tensordict.get(KEPT, None)
     place = tensordict if kept is None else tensordict.copy().update(kept)
-    return place.get(key, None)
+    check_keys(place, [key], whose, ": step with the tensordict that reset or step_mdp returned")
+    return place.get(key)
 
 
 def keep_resting(

@@ -99,11 +99,8 @@ def policy_transforms(
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps
     observation_key = observation_key or keys.OBSERVATION
-    if normalizer is not None and action_key not in normalizer.keys:
-        raise ValueError(
-            f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: fit it "
-            "to data with that key"
-        )
+    if normalizer is not None:
+        normalizer.check_has(action_key)
     execute = usual_execute(policy, prior, delay or 0) if execute is None else execute
     late: list[Transform] = []
     if see_history:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.transforms.inner_step import EnvTransform, observed, set_aside
 
 
@@ -51,15 +51,6 @@ class ObservationStack(EnvTransform):
         set_aside(tensordict, {self.observation_key: None})
         return tensordict
 
-    def _stack(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
-        stack = observed(tensordict, self.observation_key)
-        if stack is None:
-            raise KeyError(
-                f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
-                "the tensordict that reset or step_mdp returned"
-            )
-        return stack
-
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         time = next_tensordict.ndim
         newest = next_tensordict.get(self.observation_key)
@@ -75,7 +66,8 @@ class ObservationStack(EnvTransform):
                 return stack
             return torch.where(expand_as_right(rows.view(next_tensordict.shape), old), stack, old)
 
-        return next_tensordict.set(self.observation_key, _each(append, newest, self._stack(tensordict)))
+        before = observed(tensordict, self.observation_key, "ObservationStack")
+        return next_tensordict.set(self.observation_key, _each(append, newest, before))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._check_key(tensordict_reset)
@@ -94,11 +86,8 @@ class ObservationStack(EnvTransform):
         return stepped.set(self.observation_key, newest)
 
     def _check_key(self, observations: TensorDictBase | Composite) -> None:
-        if self.observation_key not in observations.keys(True):
-            raise KeyError(
-                f"ObservationStack found no {self.observation_key!r}, only "
-                f"{list(observations.keys(True, True))}: name the observation with observation_key"
-            )
+        hint = f"; there are {list(observations.keys(True, True))}: name one with observation_key"
+        check_keys(observations, [self.observation_key], "ObservationStack", hint)
         *branch, _ = key if isinstance(key := self.observation_key, tuple) else (key,)
         shape = observations[tuple(branch)].shape if branch else observations.shape
         if shape != observations.shape:
