@@ -96,8 +96,6 @@ def test_imports_point_one_way_and_name_nothing_private():
 PACKAGE = Path(warmprior.__file__).parent
 BENCHMARKS = PACKAGE.parent / "benchmarks"
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
-COMMAND_LINES = ("__main__.py",)
-"""The package's own command line."""
 
 
 def sources():
@@ -112,17 +110,6 @@ def test_the_package_names_no_option_of_a_command_line():
         if name != "__main__.py" and FLAG.search(line) and "pip install" not in line  # pip's own are fine
     ]
     assert not found, "\n".join(found)
-
-
-def test_the_package_prints_nothing():
-    calls = [
-        (name, node.lineno)
-        for name, text in sources().items()
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
-    ]
-    assert not [call for call in calls if call[0] not in COMMAND_LINES]
-    assert {name for name, _ in calls} == set(COMMAND_LINES)
 
 
 def test_the_package_knows_no_benchmark():
@@ -148,11 +135,6 @@ def test_training_loads_neither_simulator_nor_renderer_nor_experts():
     assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
     rooms = {".".join(name.split(".")[:2]) for name in new}
     assert not rooms & {"warmprior.envs", "warmprior.data", "warmprior.lerobot", "warmprior.deploy"}
-
-
-def test_scripts_find_the_lab_by_themselves():
-    for path in BENCHMARKS.glob("*.py"):
-        assert "sys.path" not in path.read_text(), path
 
 
 def test_a_renderer_that_cannot_be_loaded_stops_no_import(tmp_path):

@@ -34,11 +34,3 @@ def test_ci_covers_the_pythons_that_are_declared():
     (ci,) = (yaml.safe_load(path.read_text()) for path in WORKFLOWS if path.name == "ci.yml")
     declared = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     assert ci["jobs"]["test"]["strategy"]["matrix"]["python"] == declared
-
-
-def test_templates_and_hooks_can_be_read():
-    names = [*(ROOT / ".github").rglob("*.yml"), ROOT / ".pre-commit-config.yaml"]
-    read = {path.name: yaml.safe_load(path.read_text()) for path in names}
-    assert {"bug.yml", "idea.yml", "result.yml", "dependabot.yml"} <= set(read)
-    hooks = [hook["id"] for repo in read[".pre-commit-config.yaml"]["repos"] for hook in repo["hooks"]]
-    assert {"ruff", "ruff-format", "mypy", "codespell", "check-added-large-files", "links"} <= set(hooks)

@@ -1,7 +1,5 @@
 import copy
-import importlib
 import json
-import re
 from dataclasses import replace
 
 import budget
@@ -164,19 +162,3 @@ def test_tables_name_what_is_not_the_papers():
         (line,) = unlike(read(*words.split()), PRESETS["paper"])
         assert all(name in line for name in named) and left_out not in line
     assert unlike(FEW["paper"], FEW["paper"]) == []  # its images have a batch size of their own
-
-
-@pytest.mark.parametrize("script", ["robomimic", "prior_space_rl", "real_time_chunking"])
-def test_help_says_what_every_option_is(script, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "90")  # one column of boxes
-    with pytest.raises(SystemExit):
-        importlib.import_module(script).main(["--help"])
-    examples, _, text = capsys.readouterr().out.partition("show this help")
-    assert re.search(r"^\$ python benchmarks/\w+\.py", examples, re.M)
-    assert ":class:" not in text and "``" not in text
-    lines = "\n".join(line.strip("│ ") for line in text.splitlines())
-    entries = re.split(r"\n(?=--[a-z])", lines)[1:]
-    names, texts = zip(*(entry.split(maxsplit=1) for entry in entries), strict=True)
-    plain = [re.sub(r"\([^()]*\)|\{[^{}]*\}|--[\w.-]+", "", text) for text in texts]
-    silent = [n for n, text in zip(names, plain, strict=True) if not re.search("[a-z]{2}", text)]
-    assert len(names) > 40 and silent == []

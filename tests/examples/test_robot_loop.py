@@ -197,14 +197,3 @@ def test_the_program_says_why_it_stopped(options, fact):
     done = program(*options)
     assert done.returncode == 2
     assert done.stderr.strip().count("\n") == 0 and fact in done.stderr
-
-
-def test_it_has_the_options_that_its_page_names(example, capsys):
-    page = (SCRIPT.parents[1] / "docs" / "your_robot.md").read_text()
-    (training,) = re.findall(r"python -m warmprior train (.*?)```", page, re.S)
-    named = set(re.findall(r"(?:robot_loop\.py|`)\s*(--[a-z-]+)", page)) - {*training.split()}
-    assert {"--camera", "--unplug"} <= named
-    with pytest.raises(SystemExit):
-        example.main(["--help"])
-    listed = capsys.readouterr().out
-    assert all(option in listed for option in named)

@@ -1,6 +1,5 @@
 """A LeRobot policy in TorchRL's environments, and frozen under an agent."""
 
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -182,11 +181,3 @@ def test_names_of_cameras_that_end_alike_or_do_not_exist():
     names = entry_names(["observation.state", *images])
     assert list(names) == ["state", "left.rgb", "right.rgb", "top"]
     assert list(names.values()) == ["observation.state", *images[:3]]
-
-
-def test_a_generator_does_not_go_to_worker_processes(policy, monkeypatch):
-    actor = actor_of(policy("smolvla"), PastPrior(LENGTH))
-    assert pickle.loads(pickle.dumps(actor)).generator is not None
-    monkeypatch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())
-    with raises(RuntimeError, "same noise"):
-        pickle.loads(pickle.dumps(actor)).chosen_generator()
