@@ -97,6 +97,20 @@ def test_decisions_that_a_rollout_repeats_in_ended_rows_count_once():
     assert (decision[0, 7:] == -1).all()
 
 
+def test_equal_chunks_of_short_episodes_all_count():
+    """Episodes of one decision each, of a policy that always says the same."""
+
+    def policy(td):
+        return td.set(keys.CHUNK, torch.ones(4, ACTION_DIM))
+
+    env = TransformedEnv(CountingEnv(3), ChunkStep(4))
+    _, decision, episode = executed_actions(env.rollout(5, policy, break_when_any_done=False))
+    assert decision.tolist() == episode.tolist() == [i for i in range(5) for _ in range(3)]
+    joined = rollout_of(torch.ones(4, 3, 1), [3] * 4, [True] * 4)
+    joined["collector", "traj_ids"] = torch.arange(4)
+    assert len(executed_actions(joined)[0]) == 12
+
+
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
     with raises(KeyError, "ChunkStep"):

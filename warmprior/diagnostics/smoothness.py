@@ -50,7 +50,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside, ``("next", "done")``;
             if chunks take effect late, also the delay that :class:`InferenceDelay` writes. Rows of a
             collector may be joined, since it numbers episodes. Decisions that ``break_when_all_done`` repeats
-            in ended rows are left out.
+            in ended rows, which are equal in every entry, are left out.
 
     Returns:
         The actions ``[*B, T, d_a]``, padded with NaN where a row executed fewer than the longest; the index
@@ -85,9 +85,10 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     delay = rollout.get(keys.DELAY, None)
     if delay is not None:  # actions before a chunk took effect belong to the decision before
         decision = decision - (position < delay).long()
-    # TorchRL's `break_when_all_done` repeats an ended row's last decision until the longest row ends.
-    repeats = done[..., 1:, :] & done[..., :-1, :] & (chunk.diff(dim=-3) == 0).all(-1).all(-1, True)
-    kept[..., 1:, :] &= ~repeats
+    # TorchRL's `break_when_all_done` copies an ended row's last decision until the longest row ends.
+    copied = (done[..., 1:, :] & done[..., :-1, :]).squeeze(-1)
+    copied[copied.clone()] = _equal(rollout[..., 1:][copied], rollout[..., :-1][copied])
+    kept[..., 1:, :] &= ~copied.unsqueeze(-1)
     ended = done.squeeze(-1).clone()
     if (number := rollout.get(("collector", "traj_ids"), None)) is not None:  # rows may have been joined
         ended[..., :-1] |= number.reshape(ended.shape).diff(dim=-1) != 0
@@ -104,6 +105,16 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         decision.flatten(-2).gather(-1, order).masked_fill(~valid, -1),
         episode.flatten(-2).gather(-1, order).masked_fill(~valid, -1),
     )
+
+
+def _equal(decisions: TensorDictBase, others: TensorDictBase) -> Tensor:
+    """Return which decisions ``[N]`` are equal in every entry, bool ``[N]``."""
+    equal = torch.ones(decisions.shape, dtype=torch.bool, device=decisions.get(keys.CHUNK).device)
+    for key, value in decisions.items(True, True):
+        other = others.get(key)
+        same = (value == other) | (value != value) & (other != other)  # NaN is equal to NaN here
+        equal &= same.unsqueeze(-1).flatten(1).all(1).to(equal.device)
+    return equal
 
 
 def smoothness(rollout: TensorDictBase) -> Smoothness:
