@@ -81,7 +81,8 @@ HUGE = "data/{chunk_index:2000000000}/{file_index}.parquet"
 
 def v21(root):
     """What a folder of v2.1 has in the place of tables."""
-    info(lambda i: i.update(codebase_version="v2.1"))(root)
+    path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    info(lambda i: i.update(codebase_version="v2.1", data_path=path))(root)
     (root / "meta" / "tasks.parquet").unlink()
     (root / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": "lift"}')
 
@@ -110,6 +111,8 @@ META = {
     "v2.1": (v21, ["v2.1", "convert_dataset_v21_to_v30"]),
     **{name: (change, ["meta/info.json", f"{name}="]) for name, change in MALFORMED.items()},
     **{f"at {text}": (info_of("data_path", text), ["data_path="]) for text in TEMPLATES},
+    "data of a camera": (info_of("data_path", "{video_key}/{chunk_index}"), ["data_path="]),
+    "a number of a camera": (info_of("video_path", "{video_key:03d}"), ["video_path="]),
     "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),
     "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
     "no length": (table(EPISODES, length=entry(0, None, None)), ["length"]),

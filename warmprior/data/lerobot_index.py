@@ -149,7 +149,7 @@ def _metadata(root: Path) -> Any:
     return metadata
 
 
-_TEMPLATE = re.compile(r"([^{}]|\{(video_key|chunk_index|file_index)(:0?\d{1,2}d?)?\})*")
+_TEMPLATE = re.compile(r"([^{}]|\{(video_key|(chunk_index|file_index)(:0?\d{1,2}d?)?)\})*")
 """Paths with these fields and plain formats only: others could expand to any length."""
 
 
@@ -163,6 +163,8 @@ def _check_info(info: Any) -> str:
     need("its content", info, isinstance(info, dict))
     version, features, fps = (info.get(name) for name in ("codebase_version", "features", "fps"))
     need("codebase_version", version, isinstance(version, str))
+    if version != LEROBOT_VERSION:
+        return version  # whose other entries are different
     need("fps", fps, isinstance(fps, int | float) and fps > 0)
     need("features", features, isinstance(features, dict))
     for name, feature in features.items():
@@ -176,7 +178,8 @@ def _check_info(info: Any) -> str:
             need(f"features.{name}.{part}", value, value is None or isinstance(value, kinds))
     for name in ("data_path", "video_path"):
         if (path := info.get(name)) is not None:  # LeRobot's own by default
-            need(name, path, isinstance(path, str) and _TEMPLATE.fullmatch(path) is not None)
+            good = isinstance(path, str) and _TEMPLATE.fullmatch(path) is not None
+            need(name, path, good and (name == "video_path" or "{video_key}" not in path))
     return version
 
 
