@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.checks import check_positive, check_whole_numbers
+from warmprior.checks import check_distinct, check_positive, check_whole_numbers
 
 
 class BoxTanhNormal(TanhNormal):
@@ -78,6 +78,7 @@ class _Trunk(nn.Module):
         names = ("prediction_length", "action_dim", "observation_steps", "observation_dim")
         check_whole_numbers(**dict(zip(names, (*chunk, *observation), strict=True)))
         check_whole_numbers(hidden_dim=hidden_dim, num_layers=num_layers, out_features=out_features)
+        check_distinct("in_keys", [str(key) for key in in_keys])
         self.scales = [scales.get(unravel_key(key), 1.0) for key in in_keys]
         self.in_features = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
         norm: dict[str, Any] = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": hidden_dim}}
