@@ -25,7 +25,7 @@ from lab.tasks import (
 )
 from warmprior.data.opening import name_of_place
 from warmprior.io.distributed import check_batch, launched
-from warmprior.modules.ode import Sampling, jump_of
+from warmprior.modules.ode import Sampling
 from warmprior.training import NetworkOptions, TrainingConfig
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
@@ -80,8 +80,7 @@ class Evaluation:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
         check_given(self, "nfe", "temperature")
         for temperature in self.temperature:
-            Sampling(temperature=temperature)
-        jump_of(self.grid)
+            Sampling(temperature=temperature, grid=self.grid)
 
     @property
     def environment(self) -> dict[str, Any]:

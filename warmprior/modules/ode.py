@@ -38,21 +38,21 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
       the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
       ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
 
-    A single step is the same on every grid. Raises ValueError as :func:`jump_of` does.
+    A single step is the same on every grid. Raises ValueError at an unknown grid, or a jump outside (0, 1).
 
     Examples:
         >>> from warmprior.modules.ode import grid_parts
         >>> grid_parts("dense-jump:0.75", 4), grid_parts("dense-jump", 1)
         ([(0.0, 0.75, 3), (0.75, 1.0, 1)], [(0.0, 1.0, 1)])
     """
-    share = jump_of(grid)
+    share = _jump(grid)
     if share is None or steps == 1:
         return [(start_time, 1.0, steps)]
     jump = start_time + share * (1.0 - start_time)
     return [(start_time, jump, steps - 1), (jump, 1.0, 1)]
 
 
-def jump_of(grid: str) -> float | None:
+def _jump(grid: str) -> float | None:
     """Return the share of the way before a grid's jump, or ``None`` without one."""
     if grid == "uniform":
         return None
@@ -200,7 +200,7 @@ class Sampling:
     def __post_init__(self) -> None:
         check_whole_numbers(**given(nfe=self.nfe, max_nfe=self.max_nfe))
         self.evaluations()
-        jump_of(self.grid)
+        _jump(self.grid)  # raises at an unknown grid
         if isinstance(self.clip, Sequence):
             object.__setattr__(self, "clip", tuple(self.clip))
             if not (self.clip and all(bound >= 0 for bound in self.clip)):
