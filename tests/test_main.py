@@ -194,7 +194,6 @@ def test_train_needs_no_simulator(tmp_path, capsys, monkeypatch, task, env_name)
         ("--chunk 0", "chunk_length"),
         ("--iterations 0", "iterations"),
         ("--times start --nfe 3", "nfe=3"),
-        ("--crop-size 32 --share-encoder", "crop_size, share_encoder"),
         ("--fast-rendering", "fast_rendering"),
         ("--device gpu", "gpu"),
         ("--device meta", "meta"),

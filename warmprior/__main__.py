@@ -253,10 +253,6 @@ def train(
     check_device(device)  # before the demonstrations are read
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
     sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
-    seeing = ("encoder", "crop_size", "share_encoder")
-    unused = [name for name in seeing if getattr(network, name) != getattr(NetworkOptions, name)]
-    if unused and not data.image_keys:
-        raise ValueError(f"{', '.join(unused)} belong to images: name --image-keys, or leave them out")
     chosen = asdict(data)
     whole = Task.open(place, demos=chosen.pop("demonstrations"), **chosen)
     recorded: Any = whole.environment

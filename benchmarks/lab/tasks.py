@@ -30,7 +30,7 @@ from warmprior.keys import EPISODE
 from warmprior.modules.encoder import imagenet_weights
 from warmprior.training import NetworkOptions, Task
 from warmprior.training.files import image_names, opened, read_steps, task_name
-from warmprior.training.options import PRETRAINED
+from warmprior.training.options import OF_IMAGES, PRETRAINED
 
 GENERATED = 150
 """Default number of scripted demonstrations."""
@@ -215,9 +215,7 @@ class DataOptions:
 
 def without_images(network: NetworkOptions) -> NetworkOptions:
     """Return options with defaults for those that have no effect without images."""
-    usual = NetworkOptions()
-    names = ("encoder", "crop_size", "share_encoder")
-    return replace(network, **{name: getattr(usual, name) for name in names})
+    return replace(network, **{name: getattr(NetworkOptions, name) for name in OF_IMAGES})
 
 
 def check_network(network: NetworkOptions, data: DataOptions) -> None:

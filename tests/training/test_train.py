@@ -149,6 +149,12 @@ def test_options_of_transformers_reach_them_alone(name, value):
         NetworkOptions("chi_transformer", **{name: -1})
 
 
+def test_options_of_images_are_refused_without_images():
+    seeing = NetworkOptions(crop_size=32, share_encoder=True)
+    with raises(ValueError, "crop_size", "share_encoder", "image keys"):
+        train_policy(demonstrations(), PastPrior(4), network=seeing)
+
+
 def test_a_fresh_policy_has_the_parts_that_were_asked_for():
     task = navigation_task()
     plain = NetworkOptions(hidden_dim=8, observation_steps=1, precondition=False)

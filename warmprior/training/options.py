@@ -31,6 +31,9 @@ from warmprior.objectives.times import TimesName
 
 PRETRAINED = "resnet18-imagenet"
 
+OF_IMAGES = ("encoder", "crop_size", "share_encoder")
+"""The options that have no effect without images."""
+
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),
     "plain_mlp": (PlainMLP, "hidden_dim"),
@@ -102,13 +105,16 @@ class NetworkOptions:
     ) -> VelocityNetwork:
         """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
-        With images, ``d_o`` is the width of the vector.
+        With images, ``d_o`` is the width of the vector. Raises ValueError for options of images without any.
         """
         kind, width = _NETWORKS[self.network]
         options = self._of_transformers()
         if self.hidden_dim is not None:
             options[width] = self.hidden_dim
         encoder = None
+        unused = [name for name in OF_IMAGES if getattr(self, name) != getattr(NetworkOptions, name)]
+        if unused and not images:
+            raise ValueError(f"{', '.join(unused)} belong to images: name image keys, or leave them out")
         if images:
             encoder = ImageEncoder(
                 list(images),
