@@ -48,12 +48,13 @@ class Job:
     deaths: int = 0
     done: bool = False
 
-    def iterations(self) -> tuple[int, int] | None:
-        """Return the number of finished iterations of a training, and of all; None if unknown."""
+    def progress(self) -> tuple[str, str] | None:
+        """Return how far a training is, as a share and in iterations; None if unknown."""
         try:
             status = json.loads(self.status.read_text()) if self.status else {}
-            return status["iteration"], status["iterations"]
-        except (OSError, ValueError, KeyError):  # not written yet, or being written by another machine
+            done, total = status["iteration"], status["iterations"]
+            return f"{done / total:.0%}", f"{done:,} of {total:,} iterations"
+        except (OSError, LookupError, ArithmeticError, TypeError, ValueError):  # none yet, or damaged
             return None
 
 
@@ -209,12 +210,12 @@ class Jobs:
 
     def _show(self, bar: tqdm, running: Iterable[Job]) -> None:
         """Show the progress of trainings in the bar, or print it now and then without a terminal."""
-        trainings = {job.name: done for job in running if (done := job.iterations())}
-        bar.set_postfix_str(", ".join(f"training {n / total:.0%}" for n, total in trainings.values()))
+        trainings = {job.name: done for job in running if (done := job.progress())}
+        bar.set_postfix_str(", ".join(f"training {share}" for share, _ in trainings.values()))
         if bar.disable and time.monotonic() - self._spoke > LINES_EVERY:
             self._spoke = time.monotonic()
-            for name, (n, total) in trainings.items():
-                print(f"{name}: {n:,} of {total:,} iterations", flush=True)
+            for name, (_, iterations) in trainings.items():
+                print(f"{name}: {iterations}", flush=True)
 
     def _next(self) -> Job | None:
         """Return the job to start now, if there is one."""

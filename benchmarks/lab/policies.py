@@ -204,6 +204,7 @@ def train(policy: Policy) -> None:
         train(teacher)
     with FileLock(policy.folder / ".lock") if not rank() else nullcontext():
         if from_leader(lambda: policy.is_trained):
+            clock(policy.status)  # if it is damaged, its rows alone are missing
             return
         task, method = policy.task(), policy.method
         # A worker sees only its own GPU.

@@ -154,6 +154,9 @@ def test_without_a_terminal_trainings_say_now_and_then_how_far_they_are(tmp_path
     running = [jobs.Job("train square", play, (), status=status), jobs.Job("play square", play, ())]
     with Jobs(Run(envs=1)) as started, jobs.tqdm(disable=True) as bar:
         started._show(bar, running)
+        for text in ('{"iteration": 1, "iter', "3", '{"iteration": 1}', '{"iteration": 1, "iterations": 0}'):
+            status.write_text(text)
+            started._show(bar, running)
         status.write_text('{"iteration": 1500, "iterations": 3000}')
         started._show(bar, running)
     assert capsys.readouterr().out == "train square: 1,500 of 3,000 iterations\n"

@@ -193,6 +193,12 @@ def test_a_training_that_fails_costs_its_own_rows_alone(tmp_path, capsys, monkey
     assert "the loss became nan" in (tmp_path / "out" / "report.md").read_text()
     assert robomimic.main([*argv, "--resume"]) == 0
     assert [row["prior"] for row in stored(tmp_path / "out")][4:8] == ["past"] * 4
+    # So does a trained policy of which the file with its time is damaged.
+    (status,) = tmp_path.glob("policies/*-past-*/status.json")
+    status.write_text(status.read_text()[:-9])
+    assert robomimic.main(arguments(tmp_path / "again", seeds=1)) == 2
+    assert f"{status} is damaged: remove it" in (tmp_path / "again" / "report.md").read_text()
+    assert {row["prior"] for row in stored(tmp_path / "again")} == {"gaussian", "preview"}
 
 
 def run(folder):
