@@ -11,6 +11,7 @@ import real_time_chunking
 import robomimic
 import sigma
 
+from lab import policies as common
 from tests.benchmarks import drift
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file
@@ -75,6 +76,27 @@ def test_sigma_study(finished, dataset, validation):
     assert sigma.main([*argv, "--resume"]) == 0
     assert written(finished.parent) == after
     assert stored(out) == rows and (out / "report.md").read_text() == report
+
+
+@pytest.mark.parametrize("priors", [["gaussian"], ["gaussian", "past"]])
+def test_a_seed_that_fails_costs_no_report_of_the_others(priors, tmp_path, monkeypatch):
+    train = common.train_policy
+
+    def failing(task, prior, *args, training, **options):
+        if prior.name == "gaussian" and training.seed == 1:
+            raise FloatingPointError("the loss became nan")
+        return train(task, prior, *args, training=training, **options)
+
+    monkeypatch.setattr(common, "train_policy", failing)
+    out = tmp_path / "out"
+    assert sigma.main(drift.arguments(out, prior=priors, nfe=1)) == 2
+    report, rows = (out / "report.md").read_text(), stored(out)
+    assert "seed 1: train: the loss became nan" in report and "| Gaussian source | 1 |" in report
+    assert {(row["prior"], row["seed"]) for row in rows} == {("gaussian", 0), ("past", 0), ("past", 1)} & {
+        (prior, seed) for prior in priors for seed in range(2)
+    }
+    # Flows are compared over all seeds, so with the first method that has them.
+    assert ("relative to past, sigma 1.5, H 4" in report) == ("past" in priors)
 
 
 def test_chunk_lengths_of_two_tasks(tmp_path):
