@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import sys
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,7 +32,7 @@ from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, Forec
 from lab.mip import SECOND, MIPCoupling, TwoStepCoupling
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
 from warmprior.checks import check_finite_numbers
-from warmprior.io.files import digest_of
+from warmprior.io.files import digest_of, file_digest
 from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
 from warmprior.objectives import Coupling
@@ -151,7 +152,7 @@ METHODS: dict[str, Composition] = {
     "leap": Composition("LeaP", "#b8a9c9", LeapPrior),
 }
 
-PACKAGES = ("warmprior", "torch", "builtins")  # their code is not the user's own
+PACKAGES = {"warmprior", "torch", *sys.stdlib_module_names}  # their code is not the user's own
 OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3"]
 
 
@@ -255,7 +256,7 @@ class Method:
             # A policy is trained again when a user edits their own prior, or a class that it builds on.
             kinds = [k for k in self.parts.prior.__mro__ if k.__module__.partition(".")[0] not in PACKAGES]
             files = dict.fromkeys(map(inspect.getfile, kinds))
-            config["code"] = digest_of(*(Path(file).read_text(encoding="utf-8") for file in files))
+            config["code"] = digest_of(*(file_digest(Path(file)) for file in files))
         return config
 
     @property

@@ -43,6 +43,19 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     assert built != Method("built_on_it:More", H).config()
 
 
+def test_a_prior_of_ones_own_may_build_on_classes_without_a_source(tmp_path, monkeypatch):
+    """Those of Python that are written in C, and those of packages that are compiled."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "built_on_c.py").write_text(
+        "from _thread import _local\nfrom warmprior import PastPrior\nimport numpy.random\n"
+        "class Local(PastPrior, _local):\n    name = 'local'\n"
+        "class Random(PastPrior, numpy.random.BitGenerator):\n    name = 'random'\n"
+        "    def __init__(self, chunk_length):\n        super().__init__(chunk_length)\n"
+    )
+    for name in ("Local", "Random"):
+        assert Method(f"built_on_c:{name}", H).config()["code"]
+
+
 def test_a_temperature_that_is_named_twice_is_played_once():
     assert Method("past", H).temperatures((1.0, 0.5, 1.0)) == [1.0, 0.5]
 
