@@ -203,11 +203,13 @@ def plot_learning_curves(
 ) -> None:
     """Draw loss and success against iterations; `losses` has (iteration, loss) per method and seed."""
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
+    left.sharex(right)
     colors = colors_of(rows)
     for method, seeds in losses.items():
         for i, curve in enumerate(seeds):
             name = method if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=colors[method], lw=1.0, label=name)
+            look = {"color": colors[method], "lw": 1.0, "marker": "." if len(curve) == 1 else ""}
+            left.plot(*zip(*curve, strict=True), label=name, **look)
     for method, group in rows.groupby("method", sort=False):
         rates = group.groupby("checkpoint")["success_rate"]
         look = {"marker": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colors[method]}
@@ -216,7 +218,6 @@ def plot_learning_curves(
     dress(left, x="iteration", y="flow-matching loss (own source)")
     nfes = ", ".join(map(str, rows["nfe"].unique()))  # a method may have its own
     dress(right, x="iteration", y=f"success rate (NFE {nfes})", rate=True)
-    right.set_xlim(left.get_xlim())
     save(figure, path, title)
 
 

@@ -54,6 +54,18 @@ def test_violins_and_bars_show_what_the_seeds_of_a_method_have_in_common(tmp_pat
     assert [text.xy[1] for text in axis.texts] == pytest.approx([0.6, 0.9, 0.5, 1.0])
 
 
+@pytest.mark.parametrize("logged", [[100], [60, 80, 100]])
+def test_learning_curves_show_every_checkpoint_and_every_loss(logged, tmp_path, figures):
+    rows = labelled(compared())  # checkpoints at 50 and 100
+    losses = {"WP-Past": [[(n, 1.0) for n in logged]]}
+    plots.plot_learning_curves(losses, rows, tmp_path / "a.png", "t")
+    for axis in figures[0]:
+        low, high = axis.get_xlim()
+        assert low < 50 and high > 100
+    (line,) = figures[0][0].get_lines()  # a single point has no line
+    assert (line.get_marker() == "") == (len(logged) > 1)
+
+
 def test_priors_of_ones_own_have_colours_of_their_own():
     names = ["anchor", "damped", "last", "mean", "slow", "fast", "mine"]
     rows = pd.DataFrame([row(prior=name, sigma=1.0) for name in names])
