@@ -10,16 +10,22 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 from warmprior.io.extras import require
 from warmprior.io.workers import worker_died
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return the number of cores that this process may use; its container or `at_most` may limit them."""
+    return int(require("loky", "sim").cpu_count())
+
+
+@contextmanager
+def at_most(cores: int | None) -> Iterator[None]:
+    """Limit what `available_cores` returns in a block, here and in processes that start there."""
+    with mock.patch.dict(os.environ, {} if cores is None else {"LOKY_MAX_CPU_COUNT": str(cores)}):
+        yield
 
 
 _states: dict[str, Any] = {}

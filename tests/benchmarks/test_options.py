@@ -1,5 +1,6 @@
 import copy
 import json
+import os
 from dataclasses import replace
 
 import budget
@@ -7,6 +8,7 @@ import navigation1d
 import prior_space_rl
 import pytest
 import real_time_chunking
+import robomimic
 import sigma
 from mimicgen_tasks import FEW
 
@@ -14,7 +16,9 @@ from lab.command_line import parse, started
 from lab.options import Options
 from lab.presets import PRESETS, study
 from lab.report import unlike
+from lab.scripted import generate
 from lab.stored_options import from_record, recorded, stored_options
+from tests.benchmarks.script_parts import refused
 from tests.errors import raises
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
@@ -116,6 +120,21 @@ def test_counts_that_could_not_be_listed(tmp_path):
     for option in ("demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "envs"):
         with raises(ValueError, f"--{option}", "10,000,000", 10**23):
             read(f"--{option}", 10**23, out=tmp_path)
+
+
+def test_demonstrations_are_generated_by_no_more_processes_than_asked_for(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def working(count, state):
+        asked.append(count)
+        raise OSError("that is all")
+
+    monkeypatch.setattr(generate, "working", working)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(3))
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
+    argv = ["--task", "lift", "--demonstrations", "5", "--envs", "1", "--out", str(tmp_path / "out")]
+    assert "that is all" in refused(robomimic.main, argv, capsys)
+    assert asked == [1] and "LOKY_MAX_CPU_COUNT" not in os.environ
 
 
 def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
