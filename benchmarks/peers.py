@@ -45,6 +45,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
+from warmprior.io.files import check_writable
 from warmprior.io.script import run_script
 
 VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
@@ -299,7 +300,7 @@ def run(argv: Sequence[str] | None) -> None:
             peers.append(make(width, options.device))
     if not peers:
         raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
-    options.out.mkdir(parents=True, exist_ok=True)
+    check_writable(options.out)
     with tqdm(desc="rounds", dynamic_ncols=True) as bar:
         rows = measure(peers, options, Clock(options.repeats, bar))
     meta = facts_of_machine(
