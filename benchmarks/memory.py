@@ -16,7 +16,7 @@ import pandas as pd
 from lab.command_line import script
 from lab.options import Options
 from lab.plots import colors_of, new_figure, save
-from lab.report import summary, table
+from lab.report import baseline, summary, table
 from lab.rows import PLAYED, read_rows
 from lab.stored_options import stored_options
 
@@ -39,7 +39,7 @@ def main(argv: list[str] | None) -> None:
             raise ValueError(f"{run} measured no memory_gain: name a run of robomimic.py or pusht.py")
         top_k = stored_options(Options, run, None).evaluation.top_k  # as in the run's report
         for iterations, part in rows.groupby("iterations"):
-            summaries.append(summary(part, top_k).assign(iterations=iterations))
+            summaries.append(summary(part, top_k).assign(run=str(run), iterations=iterations))
     gains = pd.concat(summaries)
     gains = gains[gains.memory_gain.notna() & gains.gain.notna()]
     if gains.empty:
@@ -53,10 +53,10 @@ def main(argv: list[str] | None) -> None:
     axis.locator_params(axis="x", nbins=5)
     axis.set_xlabel("memory gain (0: past ignored, 1: past copied)")
     axis.set_ylabel("gain in success (points)")
-    firsts = dict.fromkeys(rows.method.iloc[0] for rows in summaries)
+    firsts = dict.fromkeys(map(baseline, summaries))
     save(figure, args.out, f"Gain over {' or '.join(firsts)}", 12)
 
-    apart = [name for name in ("chunk", "iterations") if gains[name].nunique() > 1]
+    apart = [name for name in ("run", "chunk", "iterations") if gains[name].nunique() > 1]
     text = table(gains, ["setting", *apart, "nfe", "temperature", "method"], ["memory_gain", "gain"])
     print(text, f"\nPicture: {args.out}", sep="")
 

@@ -40,6 +40,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "setting": ("", "task and style in words"),
     "method": ("", "method in words, with its options, and with sigma and H if several are compared"),
     **_COMPARED,
+    "run": ("", "folder of the run, if there are several"),
     "observations": ("d", "number of observations that were averaged"),
     # Success.
     "episodes": ("d", "evaluation episodes of the last checkpoint; in tables summed over seeds"),

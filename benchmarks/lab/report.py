@@ -151,9 +151,15 @@ def _by_temperature(rows: DataFrame) -> bool:
     return "temperature" in rows and rows.groupby("method")["temperature"].nunique().max() > 1
 
 
+def baseline(rows: DataFrame) -> str:
+    """Return the first method, also if it failed in some settings: none comes before it in any of them."""
+    later = rows["method"] != rows.groupby("setting")["method"].transform("first")
+    return next(name for name in rows["method"] if name not in set(rows["method"][later]))
+
+
 def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame:
     """Add to a summary the comparison of each method with the first one in the same setting and NFE."""
-    first, place = rows["method"].iloc[0], [name for name in keys if name != "method"]
+    first, place = baseline(rows), [name for name in keys if name != "method"]
     if not _by_temperature(rows) and "temperature" in place:  # a method may have its own
         place.remove("temperature")
     rows_of_first = rows[rows["method"] == first].set_index(place)
@@ -272,7 +278,7 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
 
     Over several settings, success is averaged and episodes are pooled.
     """
-    first, settings = rows["method"].iloc[0], rows["setting"].unique()
+    first, settings = baseline(rows), rows["setting"].unique()
     best, chances = [], []
     sums = {"success": "mean", "successes": "sum", "episodes": "sum", "task": "size"}
     for nfe, group in _placed(rows).sort_values("nfe", ascending=False).groupby("column", sort=False):
@@ -298,7 +304,7 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
 
 def terminal_table(results: DataFrame, top_k: int, width: int = 120) -> str:
     """Return the headline, then a line per setting and method with a column per NFE."""
-    rows, first = _placed(results), results["method"].iloc[0]
+    rows, first = _placed(results), baseline(results)
     several = rows["place"].nunique() > 1
     rows["line"] = rows["place"] + ", " + rows["method"] if several else rows["method"]
     frame = wide(rows, rows["text"], "line", "column").rename_axis(index=None, columns=None)
@@ -315,7 +321,7 @@ def success_report(
 
     `source` says where the demonstrations are from; the paper's are `official`.
     """
-    rows, first = _placed(results), results["method"].iloc[0]
+    rows, first = _placed(results), baseline(results)
     rows["column"] = rows["column"] + ": " + rows["method"]
     paper = (100 * rows["paper"]).map("{:.1f}".format, na_action="ignore")
     lines = {f"measured ({source or 'own'} data)": rows["text"], "paper (official data)": paper}

@@ -128,6 +128,17 @@ def test_a_summary_is_what_scipy_and_counting_say(top_k):
         assert record["paired"] == pytest.approx(stats.beta(won + 1, lost + 1).sf(0.5))
 
 
+def test_a_first_method_that_failed_in_one_setting_stays_the_first():
+    """No other takes its place: there is no gain where it is missing."""
+    rows = [row(8, prior="past"), row(9, prior="preview")]  # the Gaussian source failed on square
+    rows += [row(k, prior=prior, task="can") for prior, k in (("gaussian", 5), ("past", 8), ("preview", 2))]
+    found = report.summary(pd.DataFrame(rows), 1)
+    assert list(found["gain"].round(9).dropna()) == [0.3, -0.3] and found["gain"][:3].isna().all()
+    assert found["better"].notna().tolist() == found["won"].notna().tolist() == [False] * 3 + [True] * 2
+    for text in (report.headline(found, 1), report.terminal_table(found, 1), table(rows)):
+        assert "ain over Gaussian source" in text and "ain over WP" not in text
+
+
 def test_a_gain_and_its_probabilities_are_of_the_same_checkpoints():
     """The last checkpoint of WP-Past is its worst, and its best ones lead."""
     rows = [row(k, checkpoint=c) for c, k in ((1, 4), (2, 4), (3, 4))]
@@ -252,6 +263,15 @@ def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
         "| Square-PH | 200 | 1 | 1 | WP-Past | 0.500 | +70.0% |",
     ]
     assert is_png(tmp_path / "a.png")
+    # Two runs of a setting may differ in anything, so their gains are not averaged.
+    (tmp_path / "two" / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in one[3:]))
+    assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| Square")]
+    assert [line.split(" | ")[1:3] for line in lines] == [
+        [argv[0], "100"],
+        [argv[0], "200"],
+        [argv[1], "200"],
+    ]
     assert memory.main([str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.endswith("results.jsonl: no such file\n")
     (tmp_path / "one" / "results.jsonl").write_text('{"task": "navigation"}\n')
