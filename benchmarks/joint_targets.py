@@ -107,6 +107,7 @@ def demonstrations(style: str, count: int) -> Path:
 
 def task(options: DataOptions) -> Task:
     """Return the task: the follower's demonstrations, and square under the same controller."""
+    options.check_only("task", "data", "demonstrations", "time_limit")
     style = options.data[0]
     if style not in ("ph", "mh"):
         raise ValueError(f"--data {style} has no scripted demonstrations: choose ph or mh")

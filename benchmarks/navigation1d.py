@@ -23,7 +23,6 @@ from lab.options import Evaluation, Options, Sources, check_single
 from lab.plots import plot_flow_paths, plot_navigation
 from lab.policies import policies_of, trained_actors, write_rows
 from lab.report import labelled, table, unlike, write_report
-from lab.tasks import DataOptions
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.options import PAPER
@@ -53,10 +52,7 @@ class NavigationOptions(Options):
             raise ValueError(
                 "the toy is rolled out to its end with all noise: leave out --temperature, --play-on"
             )
-        if self.data != DataOptions():
-            raise ValueError(
-                "the toy has demonstrations of its own: leave out --task, --data and other options of data"
-            )
+        self.data.check_only()
         if self.sources.chunk[0] > STEPS:
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
 

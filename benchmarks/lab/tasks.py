@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -198,6 +198,14 @@ class DataOptions:
                 raise ValueError(
                     f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
                 )
+
+    def check_only(self, *names: str) -> None:
+        """Raise ValueError if options without these names were given: the task would pass over them."""
+        usual = DataOptions()
+        others = {f.name for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)} - {*names}
+        if others:
+            words = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(others))
+            raise ValueError(f"this task has demonstrations of its own: leave out {words}")
 
     @property
     def generated(self) -> bool:
