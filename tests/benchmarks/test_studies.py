@@ -17,7 +17,7 @@ from tests.benchmarks.script_parts import command_line, described, is_png, optio
 from tests.data.synthetic import write_robomimic_file
 from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import SharedObservations, action_error
-from warmprior.training import load_policy
+from warmprior.training import Task, load_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -162,6 +162,26 @@ def test_demonstrations_that_were_trained_on_are_not_held_out(tmp_path, given, c
     said = f"{'copy.hdf5' if given else 'lift.hdf5 (mask valid)'} has {number} demonstrations in common"
     assert said in line and "(mask train)" in line
     assert not list(tmp_path.rglob("*.safetensors"))
+
+
+@pytest.mark.parametrize("keys", [None, ["object", "robot0_eef_pos"]])
+def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(keys, tmp_path, monkeypatch):
+    """Datasets with environments of Gymnasium, and chosen observations."""
+    if keys is None:
+        test_minari = pytest.importorskip("tests.data.test_minari")
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+        vector = test_minari.Box(-9, 9, (3,), "float32")
+        place = f"minari:{test_minari.written(observation=vector, env='Pendulum-v1', expert_policy=None)}"
+        more = {"dataset": place, "task": None, "time_limit": 9}
+    else:
+        place = tmp_path / "lift.hdf5"
+        write_robomimic_file(place, lengths=(30, 5, 40), task="lift")
+        monkeypatch.setattr(drift, "task", lambda options: Task.open(place, observation_keys=keys))
+        more = {"task": f"{drift.__name__}:task"}
+    out = tmp_path / "out"
+    argv = drift.arguments(out, **more, seeds=1, episodes=None, nfe=None, observations=20)
+    assert curvature.main(argv) == 0
+    assert "observations of the TRAINING demonstrations (not held out)" in (out / "report.md").read_text()
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])
