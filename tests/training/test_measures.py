@@ -8,9 +8,9 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
 from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing, placed
-from warmprior import PastPrior, policy_transforms
+from warmprior import ChunkStep, PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
-from warmprior.training import evaluate, parallel_env, play_episode
+from warmprior.training import Task, evaluate, parallel_env, play_episode
 
 H = 4
 HOW = {"high": "max", "effort": "sum", "left": "last"}
@@ -85,6 +85,14 @@ def test_keys_that_are_not_there_are_named():
     for options in ({"success": "solved"}, {"success": "won", "measures": {"height": "max"}}):
         with raises(KeyError, *([options["success"]] if len(options) == 1 else options["measures"])):
             play_episode(POLICY, env, 0, **options)
+
+
+def test_another_way_to_combine_values_is_refused():
+    measures, env = {"high": "mean"}, make_env(execute=1)
+    task = partial(Task, "own", "human", env.fake_tensordict(), Saying)
+    for use in (partial(ChunkStep, H), task, partial(play_episode, POLICY, env, 0, success="won")):
+        with raises(ValueError, "'high'", "max, sum, last", "'mean'"):
+            use(measures=measures)
 
 
 @pytest.mark.parametrize("batched", [False, True])

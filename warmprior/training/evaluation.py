@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
-from warmprior.checks import check_whole_numbers, is_true
+from warmprior.checks import check_measures, check_whole_numbers, is_true
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
@@ -303,6 +303,7 @@ def _play_batched(
 def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, measures: Measures) -> None:
     """Raise an error if a policy cannot act in an environment, or if it lacks what is asked for."""
     check_usual_keys(policy, "evaluate")
+    check_measures(measures)
     asked, rewards = {success: "max", **measures}, env.reward_keys
     present = env.observation_spec.keys(True, True)
     for key in asked:

@@ -16,7 +16,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.checks import check_choice, check_keys, check_whole_numbers, given
+from warmprior.checks import check_keys, check_measures, check_whole_numbers, given
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -94,8 +94,7 @@ class Task:
         for part in (self.name, self.style):
             if Path(part).name != part:
                 raise ValueError(f"name and style become parts of file names, which cannot hold {part!r}")
-        for key, how in self.measures.items():
-            check_choice(f"the measure {key!r}", how, ("max", "sum", "last"))
+        check_measures(self.measures)
 
     @classmethod
     def of(

@@ -22,7 +22,7 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
-from warmprior.checks import check_between, check_whole_numbers
+from warmprior.checks import check_between, check_measures, check_whole_numbers
 from warmprior.modules.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
@@ -171,7 +171,8 @@ class ChunkStep(EnvTransform):
 
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, ``gamma`` is not in [0, 1],
-            an action is not a vector, or there are not as many chunk keys as action keys.
+            an action is not a vector, a measure is combined in another way, or there are not as many chunk
+            keys as action keys.
         KeyError: if ``action_keys`` are not exactly the environment's actions.
         RuntimeError: (at the first reset) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
@@ -215,6 +216,7 @@ class ChunkStep(EnvTransform):
             raise ValueError(f"need execute <= chunk_length <= prediction_length, got {lengths}")
         self.chunk_length, self.execute, self.prediction_length = chunk_length, execute, prediction_length
         self.gamma, self.success = gamma, unravel_key(success)
+        check_measures(measures or {})
         self.measures = {key: how for key, how in (measures or {}).items() if how != "last"}
         self._input: TensorDictBase | None = None
         self._inner: tuple[Any, InnerStep, LateTransforms | None, NestedKey] | None = None
