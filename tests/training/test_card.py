@@ -10,7 +10,14 @@ import warmprior
 from lab.cards import measured
 from lab.report import policy_results
 from tests.toy_env import mlp_actor
-from warmprior import PastPrior
+from warmprior import (
+    LinearInterpolant,
+    PastPrior,
+    PreconditionedNetwork,
+    StartPoint,
+    VelocityMLP,
+    WarmPriorActor,
+)
 from warmprior.training import model_card
 
 ACTOR = mlp_actor(PastPrior(4))
@@ -66,3 +73,24 @@ def test_what_is_not_known_is_said():
     assert "license" not in card and "Not measured" in card and "| environment | not known |" in card
     assert 'load_policy("me/it")' in card and "environment_of" not in card
     assert warmprior.__version__ in card
+
+
+class OwnPath(LinearInterpolant): ...
+
+
+class OwnNetwork(VelocityMLP): ...
+
+
+class OwnStart(StartPoint):
+    time = noise_share = 0.5
+
+
+def test_what_has_to_be_imported_is_named():
+    """Also inside of the library's own parts, where most networks are."""
+    network = PreconditionedNetwork(OwnNetwork(2, 3, 4), interpolant=OwnPath())
+    card = model_card(WarmPriorActor(network, PastPrior(4), start=OwnStart()))
+    assert {line for line in card.splitlines() if line.startswith("It needs")} == {
+        f"It needs classes of its author: import OwnStart of {__name__} and OwnPath of {__name__} and "
+        f"OwnNetwork of {__name__} first."
+    }
+    assert "It needs" not in model_card(ACTOR)

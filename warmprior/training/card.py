@@ -9,6 +9,7 @@ from typing import Any
 
 from warmprior.io.extras import require
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.registry import Registered
 from warmprior.training.saved import policy_config
 
 
@@ -90,11 +91,12 @@ def _facts(actor: WarmPriorActor) -> dict[str, str]:
 
 
 def _use(actor: WarmPriorActor, repository: str, playable: bool) -> str:
-    own = [
+    path = getattr(actor.network, "interpolant", None)
+    own = dict.fromkeys(
         f"{type(part).__name__} of {type(part).__module__}"
-        for part in (actor.prior, actor.network)
-        if not type(part).__module__.startswith("warmprior.")
-    ]
+        for part in (actor.prior, actor.start, path, *actor.network.modules())
+        if isinstance(part, Registered) and not type(part).__module__.startswith("warmprior.")
+    )
     words = f"It needs classes of its author: import {' and '.join(own)} first.\n\n" if own else ""
     lines = ["from warmprior.training import load_policy", "", f'actor = load_policy("{repository}")']
     if playable:
