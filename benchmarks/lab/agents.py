@@ -52,7 +52,7 @@ class Arm:
     method: Method
     algorithm: str
     centre: str  # centre of the box: the source's mean, or zero
-    delta: float | None  # half the width of the box
+    delta: float | None  # half the side of the box
 
     def __post_init__(self) -> None:
         if self.centre == "zero" and self.method.has_anchor:

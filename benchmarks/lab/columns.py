@@ -27,7 +27,7 @@ _COMPARED: dict[str, tuple[str, str]] = {
     "guidance": ("", "rtc: guided by Real-Time Chunking"),
     "algorithm": ("", "how the agent learns"),
     "centre": ("", "centre of the agent's box: the mean of the source, or zero"),
-    "delta": ("g", "half the width of the agent's box"),
+    "delta": ("g", "half the side of the agent's box"),
     "environment_steps": ("d", "control steps that the agent has collected"),
     "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy, stochastic: the agent"),
     "mean": ("", "history of the source: training (the data's), or deployed (from the policy's prediction)"),

@@ -41,7 +41,7 @@ def convert_robomimic(
 
     :doc:`/data` has a table of all entries and features. Numbers become float32. The first simulator state is
     kept, so that images can be compared with the simulator's before training. The folder, which is
-    returned, is written atomically: an interrupted call leaves nothing.
+    returned, is written atomically: an interrupted call leaves none.
 
     Args:
         path: a robomimic HDF5 file, such as one of scripted demonstrations.

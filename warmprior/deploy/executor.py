@@ -80,8 +80,8 @@ class AsyncExecutor:
         action_dim: ``d_a``; that of the actor's network by default.
 
     Raises:
-        ValueError: if numbers are inconsistent, an argument is missing that the actor does not provide,
-            or the normaliser lacks observations or actions.
+        ValueError: if numbers are inconsistent, an argument is missing that the actor does not provide, the
+            actor has keys of its own, or the normaliser lacks observations or actions.
 
     Examples:
         >>> import torch

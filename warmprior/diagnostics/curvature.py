@@ -186,10 +186,10 @@ def curvature(
     :math:`\|\bar v\|^2`. The paper does not say whether a prediction of ``2H`` counts whole;
     ``"..._executed"`` counts the first ``H`` positions.
 
-    A field that predicts no motion is not straight, though its curvature is tiny. So values are NaN, with a
-    warning, for observations whose mean velocity is below 1e-4 per coordinate, and all if the batch has
-    targets (windows do, rollouts do not) and the field's loss is at least 0.95 of that of a zero field.
-    Positions past an episode's end do not count.
+    A field that predicts no motion is not straight, though its curvature is tiny. So curvatures are NaN, with
+    a warning, where the mean velocity is below 1e-4 per coordinate. In windows, which have targets, all are
+    NaN if the field's loss is at least 0.95 of that of a zero field. Positions past an episode's end do not
+    count.
 
     Args:
         policy: the policy; its ``nfe`` and solver play no role.

@@ -107,10 +107,10 @@ def source_leak(
 
     The data's variance is half the mean squared difference between a window's target and that at the nearest
     observation (Euclidean, all ``To`` steps) of another episode. It is conditioned on the observation alone
-    for every prior, because WP-Preview's training mean is cut from the target, and therefore errs upwards.
-    Several modes at one observation spread far enough to hide a leak, but noise between the actions of one
-    chunk still shows, as steps inside chunks that are longer than the data's. Positions past the first ``H``
-    or past an episode's end do not count.
+    for every prior, because WP-Preview's training mean is cut from the target; so it errs upwards. Several
+    modes at one observation can hide a leak. Noise between the actions of one chunk still shows: the steps
+    inside chunks are then longer than the data's. Positions past the first ``H`` or past an episode's end do
+    not count.
 
     Args:
         policy: the policy; its state does not change.

@@ -99,14 +99,15 @@ def gym_env(
 
     Args:
         env: a Gymnasium environment whose action is one vector.
-        success: name of the entry of ``info`` that is True once the task is solved; written as bool ``[1]``.
-        measures: names of further numbers in ``info``, written as float32 ``[1]``.
+        success: name of the entry of ``info`` that is True once the task is solved; written as bool ``[1]``,
+            False where ``info`` lacks it.
+        measures: names of further numbers in ``info``, written as float32 ``[1]``, 0 where it lacks them.
         observation_keys: entries of a dictionary of observations, concatenated in this order, with
             ``"outer/inner"`` in nested ones; by default all.
         terminate_on_success: True ends the episode once the task is solved.
 
     Raises:
-        KeyError: if an entry does not exist.
+        KeyError: if the environment lacks one of ``observation_keys``.
         ValueError: if an observation is not a vector, such as a discrete one, entries of ``info`` would
             replace others or are asked of a vector environment, or (at a step) success is a fraction.
 

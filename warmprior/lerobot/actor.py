@@ -155,7 +155,8 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         seed: seed of the padding under a decoder.
 
     Raises:
-        ValueError: see :class:`WarmPriorAdapter`; also if the prior is missing, or an adapter has guidance.
+        ValueError: see :class:`WarmPriorAdapter`; also if the prior is missing, an adapter has guidance,
+            or actions are relative.
         KeyError: (when called) if an entry of the history is missing.
 
     Examples:

@@ -27,7 +27,7 @@ class StartPoint(Registered, nn.Module):
     """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
     The flow is trained from the prior's source as usual; at decisions integration starts from this point. A
-    start point is trained before the flow, and saved with the policy (``start`` of
+    start point is trained and frozen before the flow, and saved with the policy (``start`` of
     :class:`~warmprior.WarmPriorActor`).
 
     Attributes:

@@ -170,7 +170,7 @@ class Sampling:
     """The options for drawing a chunk: the noise of the source, and the integration of the flow.
 
     Attributes:
-        nfe: network evaluations per chunk; 3 by default, or ``max_nfe``.
+        nfe: network evaluations per chunk; by default 3, or what ``max_nfe`` and the solver allow.
         max_nfe: the largest ``nfe`` that the training allows: 1 for a network trained at ``t = 0`` only.
         solver: see :func:`integrate`.
         grid: see :func:`integrate`.

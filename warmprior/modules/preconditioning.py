@@ -180,10 +180,10 @@ class PreconditionedNetwork(VelocityNetwork):
     a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
     Eq. 7), whose constants assume zero means and an independent source.
 
-    Variance and scale are computed without subtractions, which would lose precision, with the source's
+    Variance and scale are computed without subtractions, which would lose precision. With the source's
     standard deviation :math:`s_0`, the covariance :math:`c` of source and target, and the standard deviation
-    :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`,
-    and the scale of :math:`F` is :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
+    :math:`q` of the target given the source, :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`.
+    The scale of :math:`F` is :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
         network: the network :math:`F`, or its ``config()``.

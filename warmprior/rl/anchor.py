@@ -72,9 +72,9 @@ class PriorAnchor(EnvTransform):
 
     The first chunk of an episode and the second half of a preview have no mean. A small box around zero would
     confine these positions to the middle of the source that the policy was trained on; a box around a draw of
-    that source does not. This transform draws before the agent acts, so that the agent sees the noise, the
-    decision process stays Markov (for WP-Past if whole chunks are executed, see
-    :func:`~warmprior.make_prior_space_actor`), and the decoder is deterministic. For a policy with a
+    that source does not. This transform draws before the agent acts: the agent sees the noise, and the
+    decoder is deterministic. So the decision process stays Markov (for WP-Past if whole chunks are executed,
+    see :func:`~warmprior.make_prior_space_actor`). For a policy with a
     :class:`~warmprior.StartPoint` the mean is that of the start point. For a policy without a moving centre
     (:func:`~warmprior.has_anchor`) the anchor is zero, which is vanilla DSRL: :math:`a_0 = \Delta`.
 

@@ -39,12 +39,12 @@ class PriorDecoder(TensorDictModuleBase):
     Args:
         actor: the policy, which is copied, or an object with the same interface, such as
             :class:`~warmprior.lerobot.LeRobotActor`.
-        delta: half the width of the agent's box, in units of the normalised action space. The paper uses 0.5
+        delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, or the policy is trained at ``t = 0`` only or is
-            guided.
+        ValueError: if ``delta`` is not a finite number > 0, or the policy is trained at ``t = 0`` only, is
+            guided, or has keys of its own.
         KeyError: (when called) if an input key is missing.
 
     Examples:
@@ -128,8 +128,8 @@ class PriorSpace(EnvTransform):
     It is the other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
     environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
     but the source is under ``("next", "decoded", "noise")`` and the chunk under ``("next", "decoded",
-    "chunk")``: TorchRL drops the entries that an inverse transform writes, so these are part of the next
-    state, where their usual names would mean the next step's.
+    "chunk")``. They are part of the next state, because TorchRL drops the entries that an inverse transform
+    writes. There their usual names would mean the next step's.
 
     Append it last, after :class:`~warmprior.PriorAnchor`, and outside batched environments: inside, every
     worker would hold a copy of the network.

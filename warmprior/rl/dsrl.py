@@ -109,7 +109,7 @@ class DSRLNALoss(LossModule):
     Raises:
         TypeError: if the actor has no distribution.
         ValueError: if an option is unknown or a network does not fit the decoder; (when called) if a critic
-            returns several values.
+            returns several values, or ``MultiStep`` has skipped decisions.
         KeyError: (when called) if the batch lacks a key.
         FloatingPointError: (when called) if a loss is NaN or infinite.
 

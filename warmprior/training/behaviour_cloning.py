@@ -72,7 +72,8 @@ class BehaviourCloning:
 
     Raises:
         ValueError: if a batch cannot be divided among the processes, the state is damaged or belongs to
-            another run, the policy could not be reloaded once saved, or the network cannot be compiled.
+            another run, the policy could not be reloaded once saved, its start point is not frozen, or the
+            network cannot be compiled.
         TypeError: if the policy cannot be saved.
 
     Examples:

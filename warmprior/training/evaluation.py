@@ -214,8 +214,8 @@ def evaluate(
 
     Raises:
         ValueError: if ``episodes < 1``; if the environment has several batch dimensions, cannot play given
-            seeds in its rows, or adds an offset to them; if it lacks the policy's normaliser; or if
-            ``success`` or ``measures`` are given with a :class:`Task`.
+            seeds in its rows, or adds an offset to them; if it lacks the policy's normaliser, or the
+            policy has keys of its own; or if ``success`` or ``measures`` are given with a :class:`Task`.
         KeyError: see :func:`play_episode`.
         WorkerError: a ``RuntimeError``, if a worker process dies.
 

@@ -189,7 +189,8 @@ class Task:
             style: style of the demonstrations, which decides robosuite's time limit: ``"ph"`` by default,
                 and ``"human"`` outside robosuite.
             actions: the policies' actions: pose deltas as recorded, or the absolute poses that these target.
-            observation_keys: observations to concatenate; by default the task's, or all of a Minari dataset.
+            observation_keys: observations to concatenate; by default the task's, or those that the reader of
+                this format chooses (:doc:`/data`).
             joint_key: the observation whose numbers the actions set, one by one, such as joint positions;
                 actions beyond its width are not targets (see :meth:`with_joints`).
             image_keys: images that policies see in addition to the robot's state, such as
@@ -205,6 +206,7 @@ class Task:
 
         Raises:
             FileNotFoundError: if there is no such file or dataset.
+            OSError: if a download fails.
             DatasetError: if the data are invalid, or their images differ from the simulator's.
             ValueError: if the file holds another task, its actions are not near ``joint_key``, or an option
                 is for another environment.

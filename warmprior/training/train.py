@@ -108,8 +108,7 @@ def train_policy(
     Keyword Args:
         observation_keys: observations to read from the file or dataset, see :meth:`Task.open`.
         image_keys: images to read from the file or dataset, see :meth:`Task.open`.
-        nfe: network evaluations per chunk, saved with the policy; 3 by default, or what the
-            solver and ``max_nfe`` allow.
+        nfe: network evaluations per chunk, saved with the policy; see :class:`~warmprior.Sampling`.
         network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
         start: the point from which integration starts; the source sample by default.
@@ -131,6 +130,7 @@ def train_policy(
         TypeError: if the demonstrations or the prior have the wrong type.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
+        FileNotFoundError: if there is no such file or dataset.
         ValueError: if the demonstrations have the wrong form, the folder belongs to a different training
             run, the device does not work, or the network cannot be compiled.
 

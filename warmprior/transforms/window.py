@@ -22,11 +22,11 @@ from warmprior.transforms.history import HistoryObservation, WithheldHistory
 class ActionWindow(Transform):
     """A transform that replaces sampled steps with training windows and their history.
 
-    For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations (the
-    episode's first one repeated at the start), the target chunk ``[i, i+P)`` (the episode's last action
-    repeated past its end, and marked in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the
-    actions before step ``i``, and the target's first ``P - H`` actions as a forecast. Windows never cross
-    episode borders. One transform serves all priors with the same lengths.
+    For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations, the target
+    chunk ``[i, i+P)`` and the history (:mod:`warmprior.history`): the actions before step ``i``, and the
+    target's first ``P - H`` actions as a forecast. Windows never cross episode borders: the episode's first
+    observation is repeated before its start, and its last action past its end, marked in
+    ``"action_is_pad"``. One transform serves all priors with the same lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
