@@ -96,6 +96,8 @@ def test_errors():
         Normalizer(one, two)
     with raises(ValueError, "['a']", "['b']"):
         Normalizer(one, {"b": torch.zeros(2)})
+    with raises(ValueError, "a", "above"):  # the dimension would count as constant
+        Normalizer(one, {"a": torch.tensor([1.0, -1.0])})
 
 
 def test_a_warning_names_tiny_actions():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.errors import raises
 from warmprior import (
     GaussianPrior,
     Normalizer,
@@ -146,6 +147,11 @@ def test_a_cast_trend_keeps_its_units(dtype):
     torch.testing.assert_close(rest.to(dtype)(normalised.to(dtype)).float(), expected, atol=0.02, rtol=0)
     trend = PoseTrend(rest, torch.zeros(2), torch.zeros(4, 2), torch.ones(4, 2)).to(dtype)
     assert {part.dtype for part in trend(normalised.to(dtype).unsqueeze(1))} == {dtype}
+
+
+def test_source_and_target_have_one_length():
+    with raises(ValueError, "target", "[3, 2]", "[4, 2]"):
+        PoseTrend(RestingJoints([0, 1]), torch.zeros(2), torch.zeros(4, 2), torch.zeros(3, 2))
 
 
 JOINTS = [1, 2, -1, 0, 3, 4, 5, 6, 7, -1]

@@ -257,11 +257,12 @@ def test_an_environment_with_images_fits_its_demonstrations():
         ({"fast_rendering": True, "make_env": NavigationEnv}, "fast_rendering"),
         ({"fast_rendering": True}, "image_keys"),
         ({"success": "solved"}, "make_env"),
+        ({"actions": "pose"}, "delta, absolute"),
     ],
 )
 def test_an_option_that_cannot_be_applied_is_refused(path, tmp_path, options, named):
     place = path
-    if "actions" in options:  # a robot's file
+    if "horizon" in options:  # a robot's file
         place = shutil.copy(path, tmp_path / "robot.hdf5")
         with h5py.File(place, "a") as file:
             del file["data"].attrs["env_args"]

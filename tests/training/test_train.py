@@ -127,6 +127,8 @@ def test_what_does_not_exist_is_refused_with_what_does():
         navigation_task("ph")
     with raises(ValueError, "network", "mlp, plain_mlp", "'nonsense'"):
         NetworkOptions(network="nonsense")
+    with raises(ValueError, "encoder", "resnet18, small", "'resnet18-imagnet'"):
+        NetworkOptions(encoder="resnet18-imagnet")  # its weights would be random
 
 
 @pytest.mark.parametrize(("name", "value"), [("observation_layers", 2), ("time_frequency", 1e-4)])

@@ -106,7 +106,8 @@ class Normalizer(RawUnits):
         high: maximum per key, each ``[d]``, raw units.
 
     Raises:
-        ValueError: if the keys or shapes of ``low`` and ``high`` differ, or values are not finite.
+        ValueError: if the keys or shapes of ``low`` and ``high`` differ, values are not finite, or a
+            minimum is above its maximum.
 
     Examples:
         >>> import torch
@@ -128,6 +129,8 @@ class Normalizer(RawUnits):
             check_shape(f"high of {key}", high[key], low[key].shape)
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
+            if (low[key] > high[key]).any():
+                raise ValueError(f"{key}: a minimum is above its maximum")
             # Halved first, because the sum of large numbers may be infinite.
             first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first

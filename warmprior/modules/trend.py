@@ -166,8 +166,11 @@ class PoseTrend(nn.Module):
     def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
         super().__init__()
         self.rest = rest
-        for name, value in (("centre", centre), ("source", source), ("target", target)):
-            shape = (rest.width,) if name == "centre" else ("P", rest.width)
+        for name, value, shape in (
+            ("centre", centre, (rest.width,)),
+            ("source", source, ("P", rest.width)),
+            ("target", target, source.shape),
+        ):
             check_shape(f"the trend's {name}", value, shape)
             if not torch.isfinite(value).all():
                 raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")

@@ -29,6 +29,8 @@ from warmprior.modules.encoder import load_imagenet
 from warmprior.objectives.flow_matching import Objective, Weighting
 from warmprior.objectives.times import TimesName
 
+Encoder = Literal["resnet18-imagenet", "resnet18", "small"]
+
 PRETRAINED = "resnet18-imagenet"
 
 OF_IMAGES = ("encoder", "crop_size", "share_encoder")
@@ -76,7 +78,7 @@ class NetworkOptions:
     observation_steps: int = 2
     observation_layers: int | None = None
     time_frequency: float | None = None
-    encoder: Literal["resnet18-imagenet", "resnet18", "small"] = "resnet18-imagenet"
+    encoder: Encoder = "resnet18-imagenet"
     crop_size: int = 76
     share_encoder: bool = False
 
@@ -84,6 +86,7 @@ class NetworkOptions:
         check_whole_numbers(observation_steps=self.observation_steps, crop_size=self.crop_size)
         check_whole_numbers(**given(hidden_dim=self.hidden_dim))
         check_choice("network", self.network, _NETWORKS)
+        check_choice("encoder", self.encoder, get_args(Encoder))
         check_whole_numbers(0, **given(observation_layers=self.observation_layers))
         check_positive(**given(time_frequency=self.time_frequency))
         for name in self._of_transformers():

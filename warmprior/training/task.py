@@ -16,7 +16,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.checks import check_keys, check_measures, check_whole_numbers, given
+from warmprior.checks import check_choice, check_keys, check_measures, check_whole_numbers, given
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -209,7 +209,7 @@ class Task:
             OSError: if a download fails.
             DatasetError: if the data are invalid, or their images differ from the simulator's.
             ValueError: if the file holds another task, its actions are not near ``joint_key``, or an option
-                is for another environment.
+                is unknown or for another environment.
 
         Examples:
             >>> from warmprior.training import Task
@@ -223,6 +223,7 @@ class Task:
         from warmprior.envs.gymnasium import registered_env
         from warmprior.training import files
 
+        check_choice("actions", actions, ("delta", "absolute"))
         outcome = given(success=success, measures=measures, video_rate=video_rate)
         if outcome and make_env is None:
             raise ValueError(f"{', '.join(outcome)} of an environment of your own: pass its make_env as well")
