@@ -64,7 +64,7 @@ class PriorSpaceConfig:
         seed: seed of all random draws.
 
     Raises:
-        ValueError: if a number is out of range.
+        ValueError: if an option is unknown or out of range.
 
     Examples:
         >>> from warmprior.rl import PriorSpaceConfig

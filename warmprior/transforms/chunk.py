@@ -163,7 +163,7 @@ class ChunkStep(EnvTransform):
         gamma: discount per control step.
         success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
             ignored if the environment does not write it.
-        measures: further keys, but states, each with ``"max"``, ``"sum"`` or ``"last"``: how its values over
+        measures: further keys (no states), each with ``"max"``, ``"sum"`` or ``"last"``: how its values over
             the executed steps become one per chunk. Sums of flags and whole numbers are int64.
         action_keys: keys of the environment's actions, vectors ``[*B, d_a]``.
         chunk_keys: keys of the chunks that replace them, ``[*B, P, d_a]``. Policies that act in the same
