@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -213,11 +213,12 @@ def demonstrations(camera: bool, rate: float, episodes: int = 40, steps: int = 6
 
 def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
     """Train a small policy, in a few seconds; a real one needs `joint_key` (docs/your_robot.md)."""
+    seeing: dict[str, Any] = {"encoder": "small", "crop_size": 28} if camera else {}
     return train_policy(
         demonstrations(camera, rate),
         PastPrior(CHUNK, correlation=0.5),
         nfe=NFE,
-        network=NetworkOptions(hidden_dim=128, encoder="small", crop_size=28),
+        network=NetworkOptions(hidden_dim=128, **seeing),
         training=TrainingConfig(iterations=iterations),
         description=None,
     )
