@@ -54,13 +54,13 @@ def falls(demonstrations: str, nfe: int) -> dict[str, str]:
     return {s: " to ".join(str(whole(100 * solved.mean())) for solved in of) for s, of in outcomes.items()}
 
 
-def pair(runs: Iterable[str], source: str, *nfes: int) -> str:
+def pair(runs: Iterable[str], source: str, *nfes: int, noise: float = 1.0) -> str:
     """Return the episodes won and lost against the Gaussian source, over runs and NFE (9, 3 and 1)."""
     won = lost = 0
     for run in runs:
         for nfe in nfes or (9, 3, 1):
             both = [
-                played(run, name, nfe).set_index(["task", "seed"])["solved"].sort_index()
+                played(run, name, nfe, noise).set_index(["task", "seed"])["solved"].sort_index()
                 for name in (source, GAUSSIAN)
             ]
             for outcomes, base in zip(*both, strict=True):
@@ -112,6 +112,9 @@ def sentences() -> dict[str, list[str]]:
     fifty_long = [whole(solved("pusht_50_80000", s, 9)) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
+    half = {s: solved("pusht_206_80000", s, 9, 0.5) for s in (GAUSSIAN, PAST)}
+    half_pair = pair(["pusht_206_80000"], PAST, 9, noise=0.5)
+    half_short = whole(solved("pusht_206_45000", GAUSSIAN, 9, 0.5))
     mip = board.loc["mip", 2]
     joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
     fall, can = falls("door, 25 human", 3), falls("can, 25 of six operators", 1)
@@ -150,6 +153,8 @@ def sentences() -> dict[str, list[str]]:
             f"it solves {spaced(long[0])}% at nine, three",
             f"the Gaussian source {spaced(long[1])} ({in_words(long[2].split(', ')[0])} at nine)",
             f"{spaced(better[0])} and {spaced(better[1])}, within chance",
+            f"{whole(half[PAST])}% with half of the noise at nine steps, and {whole(half[GAUSSIAN])} "
+            f"({in_words(half_pair)}), or {half_short} after shorter training",
         ],
         "which_source.md": [
             "after 80,000, two seeds, in "
@@ -163,11 +168,12 @@ def sentences() -> dict[str, list[str]]:
             f"and correlated noise in {door[3][CORRELATED]}%",
             f"WP-Past and WP-Preview succeed {span(few)} points more often",
             f"the Gaussian source solves {whole(pusht[206][GAUSSIAN])}% at nine steps, "
-            f"and warm sources {span([pusht[206][s] for s in WARM])}%",
-            f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (two seeds)",
+            f"warm sources {span([pusht[206][s] for s in WARM])}%",
+            f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (with half the "
+            f"noise WP-Past has {whole(half[PAST])}, the Gaussian source {whole(half[GAUSSIAN])})",
             f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
             f"solves {whole(mip['Push-T, 206'])}% with 206",
-            f"at one step {can[GAUSSIAN]}%, and {can[PAST]} (two seeds)",
+            f"at one step {can[GAUSSIAN]}%, and {can[PAST]}",
             f"the Gaussian source then solves {transport[2]}% at one step in place of {transport[0]}, "
             f"and WP-Past {transport[3]} in place of {transport[1]}",
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
