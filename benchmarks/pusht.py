@@ -48,7 +48,7 @@ def make_env(relative: bool = False) -> EnvBase:
 
 def task(options: DataOptions, relative: bool = False) -> Task:
     """Return the task: human demonstrations, and the environment that policies are played in."""
-    options.check_only("task", "data", "dataset", "demonstrations")
+    options.check_only("task", "dataset", "demonstrations")
     place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
     chosen: Any = {"observation_keys": OBSERVATION, "demos": options.first("human")}
     steps = LeRobotDemonstrations(place, **chosen).data.copy()

@@ -44,7 +44,7 @@ def no_work(monkeypatch):
         ("navigation1d", "--task can", ("--task",)),
         ("joint_targets", FILE, ("--dataset",)),
         ("joint_targets", "--time-limit 9 --mask train --download", ("--download, --mask",)),
-        ("pusht", "--time-limit 9", ("--time-limit",)),
+        ("pusht", "--time-limit 9 --data mh", ("--data, --time-limit",)),
         ("navigation1d", "--chunk 64", ("--chunk", "32", "64")),
         ("mimicgen_tasks", "--download --task stack_d0", ("NVlabs",)),
         ("sigma", f"{HELD_OUT} --chunk 4 8", ("--chunk", "4 8")),
