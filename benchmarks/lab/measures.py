@@ -109,7 +109,7 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Return held-out observations of a policy's task, and a description of them.
 
-    For a task whose observations or environment are a user's own they are its training data.
+    For the toy and for tasks outside robosuite they are the training data.
 
     Raises:
         ValueError: if there are no held-out data, or some of them were trained on (masks may overlap, and
@@ -121,8 +121,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
     validation, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
     shape: dict[str, Any] = {"observation_steps": policy.network.observation_steps}
-    own = "observation_keys" in facts or "gymnasium" in (task.environment or {})
-    if task.normalizer is None or "file" not in facts or own:
+    if task.normalizer is None or "sha256" not in facts:
         if validation is not None:
             raise ValueError(f"--validation is for robosuite's tasks: leave it out with {task.name}")
         shared = SharedObservations(task.data.to(device), chunk_length, **shape)

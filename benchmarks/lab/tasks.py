@@ -329,7 +329,8 @@ def read_like(
     if (stored := task_name(opened_place.index())) != name:  # before images are rendered
         raise ValueError(f"{place} has demonstrations of {stored}, but the policies are for {name}")
     images, called = facts.get("images"), opened_place.name
-    space: dict[str, Any] = {"absolute_actions": facts.get("actions") == "absolute"}
+    space: dict[str, Any] = {"observation_keys": facts.get("observation_keys")}
+    space |= {"absolute_actions": facts.get("actions") == "absolute"}
     if images is not None:
         place = with_images(
             place, name, images["cameras"], images["size"], images["fast_rendering"], mask=mask

@@ -10,8 +10,12 @@ import pytest
 import real_time_chunking
 import robomimic
 import sigma
+import torch
 
 from lab import policies as common
+from lab.measures import held_out
+from lab.options import MeasuredOptions, Options, Run, Sources
+from lab.tasks import DataOptions
 from tests.benchmarks import drift
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file
@@ -164,10 +168,10 @@ def test_demonstrations_that_were_trained_on_are_not_held_out(tmp_path, given, c
     assert not list(tmp_path.rglob("*.safetensors"))
 
 
-@pytest.mark.parametrize("keys", [None, ["object", "robot0_eef_pos"]])
-def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(keys, tmp_path, monkeypatch):
-    """Datasets with environments of Gymnasium, and chosen observations."""
-    if keys is None:
+@pytest.mark.parametrize("minari", [False, True])
+def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(minari, tmp_path, monkeypatch):
+    """Datasets with environments of Gymnasium, and files with an environment of one's own."""
+    if minari:
         test_minari = pytest.importorskip("tests.data.test_minari")
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
         vector = test_minari.Box(-9, 9, (3,), "float32")
@@ -176,12 +180,27 @@ def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(keys, tm
     else:
         place = tmp_path / "lift.hdf5"
         write_robomimic_file(place, lengths=(30, 5, 40), task="lift")
-        monkeypatch.setattr(drift, "task", lambda options: Task.open(place, observation_keys=keys))
+        monkeypatch.setattr(drift, "task", lambda: Task.open(place, drift.DriftEnv))
         more = {"task": f"{drift.__name__}:task"}
     out = tmp_path / "out"
     argv = drift.arguments(out, **more, seeds=1, episodes=None, nfe=None, observations=20)
     assert curvature.main(argv) == 0
     assert "observations of the TRAINING demonstrations (not held out)" in (out / "report.md").read_text()
+
+
+def test_chosen_observations_are_read_from_held_out_demonstrations(tmp_path, monkeypatch):
+    path, other, keys = tmp_path / "lift.hdf5", tmp_path / "other.hdf5", ["robot0_eef_pos", "object"]
+    write_robomimic_file(path, task="lift")
+    write_robomimic_file(other, task="lift", seed=1)
+    monkeypatch.setattr(drift, "task", lambda: Task.open(path, observation_keys=keys))
+    data, run = DataOptions(task=(f"{drift.__name__}:task",)), Run(out=tmp_path)
+    (policy,) = common.policies_of(Options(data, sources=Sources(prior=("past",)), run=run))
+    measured, words = held_out(MeasuredOptions(data, validation=other, observations=20, run=run), policy)
+    seen = policy.task().normalizer.denormalize(measured.data)["observation"]
+    torch.testing.assert_close(
+        seen, RobomimicDemonstrations(other, observation_keys=keys).data["observation"]
+    )
+    assert words == "other.hdf5"
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])
