@@ -117,7 +117,7 @@ class NetworkOptions:
         encoder = None
         unused = [name for name in OF_IMAGES if getattr(self, name) != getattr(NetworkOptions, name)]
         if unused and not images:
-            raise ValueError(f"{', '.join(unused)} would change nothing: name image keys, or leave out")
+            raise ValueError(f"{', '.join(unused)} would change nothing without image keys")
         if images:
             encoder = ImageEncoder(
                 list(images),
