@@ -51,7 +51,7 @@ def main(argv: list[str] | None) -> None:
         seeds = seeds.assign(paper=seeds.apply(paper_success, axis=1))
         text = table(seeds, ["method", "sigma"], ["success", "paper"])
         actors = trained_actors(policies, options.run.device)
-        if not any(method.is_flow for method in actors):  # a seed of each failed
+        if not any(method.is_flow for method in actors):  # a seed of each failed, so this raises
             write_report(out, text, text, rows, failures)
         flow = straightness(actors, observations)
         curvatures = write_rows(out / "curvature.jsonl", flow)
