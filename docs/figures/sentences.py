@@ -157,7 +157,7 @@ def sentences() -> dict[str, list[str]]:
             f"({in_words(half_pair)}), or {half_short} after shorter training",
         ],
         "which_source.md": [
-            "after 80,000, two seeds, in "
+            "after 80,000 in "
             f"{whole(solved('door_80000', GAUSSIAN, 3))} and {whole(solved('door_80000', CORRELATED, 3))}",
             f"after 80,000, two seeds, {fifty_long[0]} and {fifty_long[1]} against {fifty_long[2]}",
             f"{span(joints)}% at three steps",
