@@ -44,7 +44,7 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
 
 
 def test_a_prior_of_ones_own_may_build_on_classes_without_a_source(tmp_path, monkeypatch):
-    """Those of Python that are written in C, and those of packages that are compiled."""
+    """Python writes some in C, and packages compile others."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "built_on_c.py").write_text(
         "from _thread import _local\nfrom warmprior import PastPrior\nimport numpy.random\n"

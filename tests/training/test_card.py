@@ -86,7 +86,7 @@ class OwnStart(StartPoint):
 
 
 def test_what_has_to_be_imported_is_named():
-    """Also inside of the library's own parts, where most networks are."""
+    """The card looks inside the library's own parts too, where most networks are."""
     network = PreconditionedNetwork(OwnNetwork(2, 3, 4), interpolant=OwnPath())
     card = model_card(WarmPriorActor(network, PastPrior(4), start=OwnStart()))
     assert {line for line in card.splitlines() if line.startswith("It needs")} == {
