@@ -79,12 +79,6 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(listed)}, got {value!r}")
 
 
-def check_measures(measures: Mapping[Any, str]) -> None:
-    """Raise ValueError if a measure's values are combined in an unknown way."""
-    for key, how in measures.items():
-        check_choice(f"the measure {key!r}", how, ("max", "sum", "last"))
-
-
 def check_distinct(what: str, names: Sequence[str]) -> None:
     """Raise ValueError if there is no name, or one occurs twice."""
     if not names or len(set(names)) < len(names):

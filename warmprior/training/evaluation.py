@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
-from warmprior.checks import check_measures, check_whole_numbers, is_true
+from warmprior.checks import check_whole_numbers, is_true
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
@@ -25,7 +25,7 @@ from warmprior.modules.network import device_of, uncompiled
 from warmprior.training.parallel import base_of, transforms_of, watched
 from warmprior.training.row_seeds import row_seeding
 from warmprior.training.task import Task
-from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.chunk import ChunkStep, Measures, check_measures
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """A function that writes the next chunk."""
@@ -59,10 +59,6 @@ class Episode:
     steps: int
     decisions: TensorDictBase = field(compare=False, repr=False)
     measures: Mapping[str, float] = field(default_factory=dict)
-
-
-Measures = Mapping[str, Literal["max", "sum", "last"]]
-"""A mapping from an environment's keys to the way in which an episode combines their values."""
 
 
 class _Tally:

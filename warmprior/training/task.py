@@ -16,7 +16,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from warmprior.checks import check_choice, check_keys, check_measures, check_whole_numbers, given
+from warmprior.checks import check_choice, check_keys, check_whole_numbers, given
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
@@ -24,6 +24,7 @@ from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
+from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 NEAR = 0.2
@@ -81,7 +82,7 @@ class Task:
     make_env: Callable[..., EnvBase]
     normalizer: Normalizer | None = None
     success: NestedKey = SUCCESS
-    measures: Mapping[str, Literal["max", "sum", "last"]] = field(default_factory=dict)
+    measures: Measures = field(default_factory=dict)
     video_rate: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     adapters: Mapping[str, Transform] = field(default_factory=dict)
@@ -105,7 +106,7 @@ class Task:
         *,
         style: str = "human",
         success: NestedKey = SUCCESS,
-        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        measures: Measures | None = None,
         video_rate: int | None = None,
     ) -> Self:
         """Build a task from raw demonstrations; the normaliser is fitted to them.
@@ -174,7 +175,7 @@ class Task:
         demos: int | None = None,
         horizon: int | None = None,
         success: NestedKey | None = None,
-        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        measures: Measures | None = None,
         video_rate: int | None = None,
     ) -> Self:
         """Build a task from a file or dataset, with the environment that recorded it if that is known.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_non_tensor, is_tensor_collection
@@ -22,13 +22,25 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
-from warmprior.checks import check_between, check_measures, check_whole_numbers
+from warmprior.checks import check_between, check_choice, check_whole_numbers
 from warmprior.modules.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
 from warmprior.transforms.restarts import flat
 from warmprior.transforms.stack import ObservationStack
+
+How = Literal["max", "sum", "last"]
+
+Measures = Mapping[str, How]
+"""A mapping from an environment's keys to the way in which a chunk, and an episode, combine their values."""
+
+
+def check_measures(measures: Measures) -> None:
+    """Raise ValueError if a measure's values are combined in an unknown way."""
+    for key, how in measures.items():
+        check_choice(f"the measure {key!r}", how, get_args(How))
+
 
 _REACH: dict[type[Transform], Callable[[Any], int]] = {
     AbsoluteActions: lambda transform: 1,
@@ -197,7 +209,7 @@ class ChunkStep(EnvTransform):
         prediction_length: int | None = None,
         gamma: float = 1.0,
         success: NestedKey = keys.SUCCESS,
-        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        measures: Measures | None = None,
         action_keys: Sequence[NestedKey] = (keys.ACTION,),
         chunk_keys: Sequence[NestedKey] = (keys.CHUNK,),
     ) -> None:

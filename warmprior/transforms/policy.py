@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
-
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
@@ -14,7 +11,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
-from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.chunk import ChunkStep, Measures
 from warmprior.transforms.delay import InferenceDelay, check_delay, usual_execute
 from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
@@ -41,7 +38,7 @@ def policy_transforms(
     observation_key: NestedKey | None = None,
     action_key: NestedKey = keys.ACTION,
     success: NestedKey = keys.SUCCESS,
-    measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+    measures: Measures | None = None,
 ) -> Compose:
     """Return the transforms between an environment and a :class:`~warmprior.WarmPriorActor`.
 
