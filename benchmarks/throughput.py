@@ -12,6 +12,7 @@ import logging
 import os
 import socket
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
+from lab.command_line import script
 from lab.machine import facts_of_machine
 from lab.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from warmprior import (
@@ -394,7 +396,9 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
 }
 
 
-def main(argv: list[str] | None = None) -> None:
+@script("throughput.py", hint="")
+def main(argv: list[str] | None) -> None:
+    """Measure the figures and write them to `throughput.json`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     names, out = ", ".join(FIGURES), Path("runs/throughput")
@@ -404,7 +408,6 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if options.repeats < 1:
         parser.error("--repeats must be at least 1")
-    torch.set_num_threads(1)
     path = options.out / "throughput.json"
     options.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = dict.fromkeys(FIGURES)
@@ -422,4 +425,4 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -26,6 +26,7 @@ from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, model_card, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 from warmprior.training.saved import check_repository, policy_config, policy_file, push_policy
+from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.window import window_transforms
 
 Imported = tyro.conf.UseAppendAction[
@@ -210,7 +211,7 @@ class Data:
     joint_key: str | None = None
     image_keys: tuple[str, ...] = ()
     fast_rendering: bool = False
-    actions: Literal["delta", "absolute"] = "delta"
+    actions: Actions = "delta"
     mask: str | None = None
     demonstrations: int | None = None
     task: str | None = None

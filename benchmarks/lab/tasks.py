@@ -31,6 +31,7 @@ from warmprior.modules.encoder import imagenet_weights
 from warmprior.training import NetworkOptions, Task
 from warmprior.training.files import image_names, opened, read_steps, task_name
 from warmprior.training.options import OF_IMAGES, PRETRAINED
+from warmprior.transforms.absolute_actions import Actions
 
 GENERATED = 150
 """Default number of scripted demonstrations."""
@@ -136,7 +137,7 @@ class DataOptions:
     mask: str | None = None
     time_limit: int | None = None
     demonstrations: tuple[int, ...] = ()
-    actions: Literal["delta", "absolute"] = "delta"
+    actions: Actions = "delta"
     obs: Literal["state", "image"] = "state"
     cameras: tuple[str, ...] = ()
     image_size: int = 84
@@ -200,12 +201,14 @@ class DataOptions:
                 )
 
     def check_only(self, *names: str) -> None:
-        """Raise ValueError if options without these names were given: the task would pass over them."""
+        """Raise ValueError if the task would pass over an option: it reads only those with these names."""
         usual = DataOptions()
         others = {f.name for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)} - {*names}
         if others:
             words = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(others))
             raise ValueError(f"this task has demonstrations of its own: leave out {words}")
+        if "data" not in names and len(self.demonstrations) > 1:
+            raise ValueError(f"this task takes one number of --demonstrations, got {self.demonstrations}")
 
     @property
     def generated(self) -> bool:

@@ -45,6 +45,7 @@ def no_work(monkeypatch):
         ("joint_targets", FILE, ("--dataset",)),
         ("joint_targets", "--time-limit 9 --mask train --download", ("--download, --mask",)),
         ("pusht", "--time-limit 9 --data mh", ("--data, --time-limit",)),
+        ("pusht", "--demonstrations 25 50", ("--demonstrations", "(25, 50)")),
         ("navigation1d", "--chunk 64", ("--chunk", "32", "64")),
         ("mimicgen_tasks", "--download --task stack_d0", ("NVlabs",)),
         ("sigma", f"{HELD_OUT} --chunk 4 8", ("--chunk", "4 8")),

@@ -8,6 +8,8 @@ import pytest
 import throughput
 import torch
 
+from tests.benchmarks.script_parts import refused
+from tests.errors import missing
 from warmprior import GaussianPrior, window_replay_buffer
 
 
@@ -39,6 +41,12 @@ def test_peers_learn_from_the_same_windows(name):
 def throughputs(folder, *argv):
     throughput.main([*argv, "--repeats", "1", "--out", str(folder)])
     return json.loads((folder / "throughput.json").read_text())
+
+
+def test_throughput_reports_a_folder_that_is_a_file(tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    argv = ["--only", "windows_over_torch", "--out", tmp_path / "taken"]
+    assert not missing(refused(throughput.main, argv, capsys), "throughput.py", "taken")
 
 
 def test_throughput_writes_every_key(tmp_path):

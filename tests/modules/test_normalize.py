@@ -85,6 +85,9 @@ def test_errors():
         for convert in (fitted.normalize, fitted.denormalize):  # one number would be broadcast
             with raises(ValueError, key, "[5, 1]", f"[{wide}]"):
                 convert(narrow.select(key))
+    for ends in (fitted.loc, fitted.scale):
+        with raises(ValueError, "state", "observation"):
+            ends("state")
     with raises(ValueError, "observation", "[9]", "[4]"):
         TransformedEnv(NavigationEnv(), fitted.env_transforms()[0]).observation_spec  # noqa: B018
     for key in ("state", ("agent", "state")):  # an entry that the environment lacks would stay as it is

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, get_args
 
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
@@ -16,7 +16,7 @@ from warmprior.envs.gymnasium import registered_env
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import uncompiled
-from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.transforms.absolute_actions import AbsoluteActions, Actions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
@@ -26,7 +26,7 @@ _IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
 def environment_description(
     env_args: Mapping[str, Any],
     style: str,
-    actions: Literal["delta", "absolute"] = "delta",
+    actions: Actions = "delta",
     images: Mapping[str, Any] | None = None,
     *,
     low_dim_keys: Sequence[str] | None = None,
@@ -170,7 +170,7 @@ def _is_complete(description: Any) -> bool:
         return (
             description.keys() - {"actions", "images"} == {"robosuite"}
             and description["robosuite"].keys() - {"low_dim_keys", "horizon"} == {"env_args", "style"}
-            and description.get("actions", "delta") in ("delta", "absolute")
+            and description.get("actions", "delta") in get_args(Actions)
             and images.keys() == set(_IMAGES)
         )
     except AttributeError:  # no description, or the user's own

@@ -184,10 +184,12 @@ class Normalizer(RawUnits):
 
     def loc(self, key: NestedKey) -> Tensor:
         """Return the middle of the range of ``key``, ``[d]``, raw units."""
+        self.check_has(key)
         return self.get_buffer(_name(key, "loc"))
 
     def scale(self, key: NestedKey) -> Tensor:
         """Return half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
+        self.check_has(key)
         return self.get_buffer(_name(key, "scale"))
 
     def check_has(self, *needed: NestedKey) -> None:

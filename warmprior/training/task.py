@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -24,6 +24,7 @@ from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
+from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
@@ -166,7 +167,7 @@ class Task:
         *,
         task: str | None = None,
         style: str | None = None,
-        actions: Literal["delta", "absolute"] = "delta",
+        actions: Actions = "delta",
         observation_keys: Sequence[str] | None = None,
         joint_key: str | None = None,
         image_keys: Sequence[str] = (),
@@ -224,7 +225,7 @@ class Task:
         from warmprior.envs.gymnasium import registered_env
         from warmprior.training import files
 
-        check_choice("actions", actions, ("delta", "absolute"))
+        check_choice("actions", actions, get_args(Actions))
         outcome = given(success=success, measures=measures, video_rate=video_rate)
         if outcome and make_env is None:
             raise ValueError(f"{', '.join(outcome)} of an environment of your own: pass its make_env as well")
