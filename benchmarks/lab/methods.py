@@ -16,6 +16,7 @@ from __future__ import annotations
 import inspect
 import json
 import sys
+import sysconfig
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -152,7 +153,7 @@ METHODS: dict[str, Composition] = {
     "leap": Composition("LeaP", "#b8a9c9", LeapPrior),
 }
 
-PACKAGES = {"warmprior", "torch", *sys.stdlib_module_names}  # their code is not the user's own
+PACKAGES = {"warmprior", "lab", "torch", *sys.stdlib_module_names}  # their code is not the user's own
 OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3"]
 
 
@@ -170,6 +171,23 @@ def composition(name: str) -> Composition:
             f"{name} has the name of the method {prior.name!r}: set another class attribute name"
         )
     return Composition(prior.name, color(prior.name), prior)
+
+
+def own_files(kind: type) -> list[Path]:
+    """Return the file of a user's class, and those of their own modules that it uses, through any others.
+
+    Installed packages are not their own, but the one that has the class.
+    """
+    package, installed = kind.__module__.partition(".")[0], sysconfig.get_path("purelib")
+    modules, files = [sys.modules[kind.__module__]], []
+    for module in modules:  # the list grows
+        file, root = getattr(module, "__file__", None), module.__name__.partition(".")[0]
+        if file is None or root in PACKAGES or (root != package and file.startswith(installed)):
+            continue
+        files.append(Path(file))
+        used = (inspect.getmodule(value) for value in vars(module).values())
+        modules += [other for other in dict.fromkeys(used) if other is not None and other not in modules]
+    return files
 
 
 def label(name: str, options: str = "") -> str:
@@ -253,10 +271,8 @@ class Method:
         """Return everything that makes it differ from other methods, as JSON."""
         config = {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
         if self.text.partition(",")[0] not in METHODS:
-            # A policy is trained again when a user edits their own prior, or a class that it builds on.
-            kinds = [k for k in self.parts.prior.__mro__ if k.__module__.partition(".")[0] not in PACKAGES]
-            files = dict.fromkeys(map(inspect.getfile, kinds))
-            config["code"] = digest_of(*(file_digest(Path(file)) for file in files))
+            # A policy is trained again when a user edits their own prior, or code of theirs that it uses.
+            config["code"] = digest_of(*map(file_digest, own_files(self.parts.prior)))
         return config
 
     @property

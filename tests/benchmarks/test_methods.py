@@ -37,10 +37,21 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     (tmp_path / "built_on_it.py").write_text(
         "import edited_prior\nclass More(edited_prior.Mine):\n    name = 'more'\n"
     )
-    built = Method("built_on_it:More", H).config()
+    (tmp_path / "helped_by_it.py").write_text(
+        "from warmprior import PastPrior\nfrom numbers_of_mine import gain\n"
+        "class Helped(PastPrior):\n    name = 'helped'\n"
+        "    def mean(self, history):\n        loc, warm = super().mean(history)\n"
+        "        return gain() * loc, warm\n"
+    )
+    (tmp_path / "numbers_of_mine.py").write_text(
+        "import torch\nimport edited_prior as my\ndef gain():\n    return my.Mine.default_sigma\n"
+    )
+    others = ("built_on_it:More", "helped_by_it:Helped")
+    before = [Method(name, H).config() for name in others]
     file.write_text(code + "    default_sigma = 0.05\n")
     assert one == same != Method("edited_prior:Mine", H).config()
-    assert built != Method("built_on_it:More", H).config()
+    after = [Method(name, H).config() for name in others]
+    assert all(old != new for old, new in zip(before, after, strict=True))
 
 
 def test_a_prior_of_ones_own_may_build_on_classes_without_a_source(tmp_path, monkeypatch):
