@@ -42,7 +42,7 @@ class BridgeInterpolant(Interpolant):
 
     name = "bridge"
 
-    def __init__(self, sigma: float = 0.5) -> None:
+    def __init__(self, sigma: float) -> None:
         check_finite_numbers(sigma=sigma)
         if sigma <= 0:
             raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
@@ -92,7 +92,7 @@ class BridgeCoupling(OTCoupling):
 
     ROUNDS: ClassVar[int] = 5  # Sinkhorn iterations at each noise level, five times as many at the last
 
-    def __init__(self, sigma: float = 0.5, observation_weight: float = 10.0) -> None:
+    def __init__(self, sigma: float, observation_weight: float = 10.0) -> None:
         super().__init__(observation_weight)
         self.interpolant = BridgeInterpolant(sigma)
 

@@ -111,8 +111,11 @@ def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
     return ReflowCoupling(teacher, teacher_nfe)
 
 
-def bridge(noise: float = 0.5, observation_weight: float = 10.0) -> BridgeCoupling:
-    """Return the coupling of a Schroedinger bridge; its noise is not the sigma of a source."""
+def bridge(noise: float = 0.1, observation_weight: float = 10.0) -> BridgeCoupling:
+    """Return the coupling of a Schroedinger bridge; its noise is not the sigma of a source.
+
+    Nine Euler steps leave noise of 0.5% of an action's half range, and with a noise of 0.5 they leave 7%.
+    """
     return BridgeCoupling(noise, observation_weight)
 
 

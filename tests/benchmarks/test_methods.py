@@ -111,12 +111,12 @@ def test_history_is_withheld_from_those_alone_that_remember():
 
 def test_the_noise_of_a_bridge_is_an_option_with_a_name_of_its_own():
     """It is no sigma of a source: rows name it, and --sigma leaves it alone."""
-    for noise, options in ((0.5, ""), (1.0, "noise=1.0"), (0.1, "noise=0.1")):
+    for noise, options in ((0.1, ""), (1.0, "noise=1.0"), (0.5, "noise=0.5")):
         method = Method(f"bridge,noise={noise}", H, 0.3)
         coupling = method.coupling()
         assert isinstance(coupling, BridgeCoupling) and coupling.config()["sigma"] == noise
         assert (method.options, method.sigma, method.is_straight) == (options, 1.0, False)
-    assert Method("bridge", H) == Method("bridge,noise=0.5", H) and Method("ot", H).is_straight
+    assert Method("bridge", H) == Method("bridge,noise=0.1", H) and Method("ot", H).is_straight
 
 
 def test_couplings_are_those_of_the_table():
