@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import torch
@@ -188,7 +188,10 @@ def own_files(kind: type) -> list[Path]:
         if file is None or root in PACKAGES or (root != package and file.startswith(installed)):
             continue
         files.append(Path(file))
-        used = (inspect.getmodule(value) for value in vars(module).values())
+        # A package also holds the parts that anyone has imported so far, which differ between processes.
+        passed_over = ModuleType if hasattr(module, "__path__") else ()
+        values = (value for value in vars(module).values() if not isinstance(value, passed_over))
+        used = map(inspect.getmodule, values)
         modules += [other for other in dict.fromkeys(used) if other is not None and other not in modules]
     return files
 

@@ -1,3 +1,4 @@
+import importlib
 import pickle
 
 import torch
@@ -52,6 +53,20 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     assert one == same != Method("edited_prior:Mine", H).config()
     after = [Method(name, H).config() for name in others]
     assert all(old != new for old, new in zip(before, after, strict=True))
+
+
+def test_what_else_is_imported_from_a_package_makes_no_other_prior(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "parts_of_mine").mkdir()
+    for name in ("__init__", "helpers", "tasks"):
+        (tmp_path / "parts_of_mine" / f"{name}.py").touch()
+    (tmp_path / "parts_of_mine" / "priors.py").write_text(
+        "import parts_of_mine.helpers\nfrom warmprior import PastPrior\n"
+        "class Packed(PastPrior):\n    name = 'packed'\n"
+    )
+    before = Method("parts_of_mine.priors:Packed", H).config()
+    importlib.import_module("parts_of_mine.tasks")
+    assert Method("parts_of_mine.priors:Packed", H).config() == before
 
 
 def test_a_prior_of_ones_own_may_build_on_classes_without_a_source(tmp_path, monkeypatch):
