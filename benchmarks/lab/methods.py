@@ -189,8 +189,8 @@ def own_files(kind: type) -> list[Path]:
             continue
         files.append(Path(file))
         # A package also holds the parts that anyone has imported so far, which differ between processes.
-        passed_over = ModuleType if hasattr(module, "__path__") else ()
-        values = (value for value in vars(module).values() if not isinstance(value, passed_over))
+        parts = ModuleType if hasattr(module, "__path__") else ()
+        values = (value for value in vars(module).values() if not isinstance(value, parts))
         used = map(inspect.getmodule, values)
         modules += [other for other in dict.fromkeys(used) if other is not None and other not in modules]
     return files
