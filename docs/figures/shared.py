@@ -25,6 +25,7 @@ DOCS = Path(__file__).parents[1]
 DATA, OUT = DOCS / "results", DOCS / "_static" / "results"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
 CORRELATED = "past,correlation=0.5"
+CVAE = "cvae"
 SOURCES = {  # label, colour and marker in charts
     GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
     PAST: ("WP-Past", "#1f77b4", "o"),
