@@ -207,8 +207,7 @@ def sentences() -> dict[str, list[str]]:
             f"the first had led, and lead too ({against(later)})",
             f"from {squared[1]} to {one_loss[GAUSSIAN][1]}% at one step "
             f"({gained[1]}) and to {one_loss[GAUSSIAN][9]} at nine ({gained[9]})",
-            f"correlated noise solves {one_loss[CORRELATED][9]}% at nine "
-            f"({against(beside_one_loss)})",
+            f"correlated noise solves {one_loss[CORRELATED][9]}% at nine ({against(beside_one_loss)})",
             f"ahead of the Gaussian source at nine steps ({against(mip_pair)}), "
             f"and of WP-Past within chance ({against(mip_beside_past)})",
             f"ahead of the Gaussian source ({against(past_once)}, two-sided",
