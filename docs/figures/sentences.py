@@ -166,8 +166,8 @@ def sentences() -> dict[str, list[str]]:
         "../README.md": [
             f"the Gaussian source solves {one_loss[GAUSSIAN][9]}%, WP-Past {past_one_loss} and WP-Past with "
             f"correlated noise {one_loss[CORRELATED][9]}",
-            f"without a source, solves {whole(mip['mean'])}%",
-            f"the decoder of a CVAE, solves most: {learned[9]}% ({in_words(against(learned_pairs.loc[9]))})",
+            f"without a source, which solves {whole(mip['mean'])}%",
+            f"the decoder of a CVAE, solves most, {learned[9]}% ({in_words(against(learned_pairs.loc[9]))})",
             f"solves {whole(board.loc[PAST, 9]['mean'])}% of the episodes and the Gaussian source "
             f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
             f"({best_mean[PAST]} and {best_mean[GAUSSIAN]}%)",
