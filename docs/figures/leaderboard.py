@@ -67,8 +67,8 @@ def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
     return with_own_noise(rows) if own_noise else rows
 
 
-def pairs(sets: Sets = HUMAN, baseline: str = GAUSSIAN) -> DataFrame:
-    """Return episodes won and lost against a source, over all sets.
+def pairs(sets: Sets = HUMAN, baseline: str = GAUSSIAN, by: Sequence[str] = ("source", "nfe")) -> DataFrame:
+    """Return episodes won and lost against a source, over all sets, or by more columns.
 
     That source has the same NFE, or, if it was not played with that, its largest.
     """
@@ -82,7 +82,7 @@ def pairs(sets: Sets = HUMAN, baseline: str = GAUSSIAN) -> DataFrame:
     for ahead, name in (1, "won"), (-1, "lost"):
         differences = both["solved"] - both["solved_base"]
         both[name] = [(ahead * difference > 0).sum() for difference in differences]
-    return both.groupby(["source", "nfe"])[["won", "lost"]].sum().astype(int)
+    return both.groupby([*by])[["won", "lost"]].sum().astype(int)
 
 
 def with_best_noise(sets: Sets = HUMAN) -> dict[tuple[str, int], float]:

@@ -90,15 +90,6 @@ def gain(runs: Iterable[str], source: str, nfe: int) -> float:
     return mean(runs, source, nfe) - mean(runs, GAUSSIAN, nfe)
 
 
-def by_training(source: str, nfe: int) -> DataFrame:
-    """Return episodes won and lost against the Gaussian source on human data, a row per training."""
-    rows = trials().query("nfe == @nfe").set_index(["set", "seed"])
-    both = rows[rows["source"] == source].join(rows[rows["source"] == GAUSSIAN], rsuffix="_base")
-    differences = both["solved"] - both["solved_base"]
-    counts = {"won": [(d > 0).sum() for d in differences], "lost": [(d < 0).sum() for d in differences]}
-    return DataFrame(counts, both.index)
-
-
 def at_best_noise(source: str, nfe: int) -> str:
     """Return episodes won and lost against the Gaussian source on human data, with each one's best noise."""
     rows, won, lost = trials(own_noise=False).query("nfe == @nfe"), 0, 0
@@ -160,7 +151,8 @@ def sentences() -> dict[str, list[str]]:
     beside_one_loss = pairs(baseline=f"{GAUSSIAN},l1").loc[f"{CORRELATED},l1", 9]
     past_one_loss = whole(board.loc[f"{PAST},l1", 9]["mean"])
     learned = {nfe: whole(board.loc[CVAE, nfe]["mean"]) for nfe in (9, 1)}
-    learned_pairs, trainings = pairs().loc[CVAE], by_training(CVAE, 9)
+    learned_pairs = pairs().loc[CVAE]
+    trainings = pairs(by=("source", "nfe", "set", "seed")).loc[CVAE, 9]
     ahead, later = (trainings["won"] > trainings["lost"]).sum(), trainings.query("seed > 0").sum()
     return {
         "../README.md": [
