@@ -36,7 +36,6 @@ from lab.presets import PRESETS, adapted
 from lab.tasks import check_counts
 from lab.timing import Clock
 from warmprior.checks import check_choice, check_positive
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import check_writable, write_atomic
 
 ROOT = Path(__file__).parents[1]
@@ -185,10 +184,10 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
         for nfe in p.method.nfes(options.evaluation.nfe)
         for temperature in p.method.temperatures(options.evaluation.temperature)
     }
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + options.evaluation.episodes)
+    jobs_per_cell = range(0, options.evaluation.episodes, EPISODES_PER_JOB)
     with Jobs(options.run) as jobs:
-        for ((policy, cell), episodes), i in product(cells.items(), range(0, len(seeds), EPISODES_PER_JOB)):
-            seeds_of_job = seeds[i : i + EPISODES_PER_JOB]
+        for ((policy, cell), episodes), i in product(cells.items(), jobs_per_cell):
+            seeds_of_job = options.evaluation.starts(policy.training.seed)[i : i + EPISODES_PER_JOB]
             work = play, policy, cell, options.evaluation, seeds_of_job
             jobs.submit(f"play {policy}, {cell}, from {seeds_of_job[0]}", *work, then=episodes.extend)
         if failures := jobs.wait():

@@ -38,7 +38,6 @@ from lab.report import labelled, setting_title, table, write_report
 from lab.rows import AGENT, read_rows
 from lab.tasks import DataOptions
 from warmprior import WarmPriorActor
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import read_json
 from warmprior.io.workers import torch_threads
 from warmprior.rl import PriorSpaceTraining
@@ -150,7 +149,7 @@ def learn(
         partial(environment, actor, options.is_toy, options.num_envs, parts),
         options.agent(arm, seed),
         out / slug(name.replace(" ", "-")),
-        evaluation_seed=EVALUATION_SEED,
+        evaluation_seed=options.evaluation.starts(seed).start,
         description=name,
         collect=rounds,
     )

@@ -47,7 +47,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "successes": ("d", "episodes solved"),
     "success_rate": (".1%", "share of episodes solved"),
     "outcomes": ("", "1 (solved) or 0 for every episode, in the order of their seeds"),
-    "success": (".1%", "success rate: per seed the mean of the best --top-k checkpoints"),
+    "first_episode": ("d", "simulator seed of the first episode; each training seed has its own"),
+    "success": (
+        ".1%",
+        "success rate: per seed the mean of the best --top-k checkpoints, chosen on other episodes",
+    ),
     "seeds": ("d", "training seeds"),
     "checkpoints": ("d", "checkpoints per training"),
     "low": (

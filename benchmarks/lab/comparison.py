@@ -19,7 +19,6 @@ from lab.methods import Method
 from lab.options import Evaluation, Options
 from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
 from lab.rows import PLAYED, read_rows
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic
 from warmprior.training import Episode
@@ -165,7 +164,7 @@ def submit(
     for temperature in dict.fromkeys(cell.temperature for cell in cells if cell.checkpoint == last):
         job_name, then = f"measure {policy}, temperature {temperature}", partial(measured, temperature)
         jobs.submit(job_name, measure, policy, evaluation.nfe, temperature, then=then, **after)
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
+    seeds = evaluation.starts(policy.training.seed)
     for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
         job_options, job_seeds = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
         jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, job_seeds, **job_options)

@@ -24,9 +24,13 @@ from lab.tasks import (
     without_images,
 )
 from warmprior.data.opening import name_of_place
+from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import check_batch, launched
 from warmprior.modules.ode import Sampling
 from warmprior.training import NetworkOptions, TrainingConfig
+
+STARTS = 10_000
+"""The number of simulator seeds that each training seed has for its evaluation episodes."""
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
@@ -72,15 +76,27 @@ class Evaluation:
     episodes: int = 25  # evaluation episodes per policy, NFE and temperature
     nfe: tuple[int, ...] = (9, 3, 1)  # network evaluations per chunk
     temperature: tuple[float, ...] = (1.0,)  # factors of the source's noise at decisions
-    top_k: int = 1  # number of best checkpoints to average per seed
+    top_k: int = 1  # number of best checkpoints to average per seed, chosen on other episodes
     play_on: bool = False  # play on after success, up to the time limit
     grid: str = "uniform"  # times of the steps: uniform, dense-jump or dense-jump:TIME
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
         check_given(self, "nfe", "temperature")
+        if self.episodes > STARTS:
+            raise ValueError(f"--episodes must be at most {STARTS:,}, got {self.episodes}")
         for temperature in self.temperature:
             Sampling(temperature=temperature, grid=self.grid)
+
+    def starts(self, training_seed: int) -> range:
+        """Return the simulator seeds of the episodes that policies of a training seed play.
+
+        They are the same for all methods, and differ between training seeds: only then do several trainings
+        tell how far the success rate varies.
+        """
+        # Simulators take seeds below 2**32.
+        first = EVALUATION_SEED + STARTS * (training_seed % 100_000)
+        return range(first, first + self.episodes)
 
     @property
     def environment(self) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from lab.policies import Policy
 from lab.report import at_fewest, labelled, per_seed
 from lab.tasks import title_of
 from warmprior.envs.rendering import rendering_backend
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.training import record_filmstrip
 
 
@@ -69,6 +68,7 @@ def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
     nfe, task, actor = min(policy.method.nfes(options.evaluation.nfe)), policy.task(), policy.load()
     if policy.method.is_flow:
         actor = actor.replace(temperature=max(options.evaluation.temperature))
+    first = options.evaluation.starts(policy.training.seed).start
     slug = re.sub(r"[^\w.]+", "-", method if "," in method else policy.method.name)
     video = options.run.folder / f"video_{slug}{suffix}.mp4"
     env_options: dict[str, Any] = options.evaluation.environment
@@ -76,7 +76,7 @@ def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
         env_options = {"env": task.env(actor), "rate": task.video_rate, "success": task.success}
     strip = record_filmstrip(
         actor,
-        seed=EVALUATION_SEED,
+        seed=first,
         nfe=nfe,
         policy_seed=policy.training.seed,
         video=video if find_spec("av") else None,
@@ -87,5 +87,5 @@ def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
         strip.frames,
         [f"step {step}" for step in strip.steps],
         options.run.folder / f"filmstrip_{slug}{suffix}.png",
-        title=f"{method}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
+        title=f"{method}, NFE {nfe}, episode {first}: {outcome}",
     )

@@ -384,6 +384,7 @@ def row(
     return {
         **policy.facts,
         **cell.facts(),
+        "first_episode": episodes[0].seed,
         "episodes": len(solved),
         "successes": sum(solved),
         "success_rate": sum(solved) / len(solved),

@@ -24,7 +24,7 @@ from lab.options import Options, with_parts
 from lab.paper import paper_success
 from lab.presets import IMAGES
 from lab.rows import read_rows
-from lab.statistics import paired_probability_better, probability_better
+from lab.statistics import paired_probability_better, probability_better, weights_elsewhere
 from warmprior.diagnostics import success_posterior
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
@@ -83,8 +83,9 @@ def labelled(rows: DataFrame, *apart: str) -> DataFrame:
 def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
     """Return a row per training and setting of play, averaged over its best `top_k` checkpoints.
 
-    All measures are averaged over the same checkpoints. These played the same episodes, so an episode counts
-    once, with the mean of its outcomes (`solved`); reports derive all numbers on success from that.
+    One half of the episodes chooses the checkpoints that the other half is reported of, so the choice does
+    not raise the success rate. Other measures are averaged with the same weights. An episode counts once,
+    with the mean of its outcomes (`solved`); reports derive all numbers on success from that.
     """
     keys = [name for name in ("policy", "nfe", "delay", "guidance", "temperature") if name in rows]
     groups = rows.reset_index(drop=True).groupby(keys, sort=False, dropna=False)
@@ -92,16 +93,19 @@ def per_seed(rows: DataFrame, top_k: int) -> DataFrame:
 
 
 def _of_best(group: DataFrame, top_k: int) -> Series:
-    last, best = group.loc[group["checkpoint"].idxmax()].copy(), group
+    group = group.sort_values("checkpoint", ascending=False)
+    last = group.iloc[0].copy()
+    outcomes = np.array([[*map(int, text)] for text in group["outcomes"]])
+    weights = weights_elsewhere(outcomes, top_k)
     if len(group) > 1:
-        best = group.sort_values(["success_rate", "checkpoint"], ascending=False).head(top_k)
-        measured = best.select_dtypes("number").drop(columns=[*IDENTITY], errors="ignore")
-        last.update(measured.mean())
-    if "outcomes" in group and best["outcomes"].notna().all():
-        solved = np.mean([np.array([*map(int, outcomes)]) for outcomes in best["outcomes"]], 0)
-        last["solved"] = solved
-    last["success"] = last["success_rate"] = best["success_rate"].mean()
-    last["successes"] = best["successes"].mean()
+        measured = group.select_dtypes("number").drop(columns=[*IDENTITY], errors="ignore")
+        shares = weights.mean(1)
+        for name, values in measured.items():
+            counted = values.notna().to_numpy() & (shares > 0)
+            last[name] = np.average(values[counted], weights=shares[counted]) if counted.any() else math.nan
+    last["solved"] = (weights * outcomes).sum(0)
+    last["success"] = last["success_rate"] = last["solved"].mean()
+    last["successes"] = last["solved"].sum()
     last["checkpoints"] = group["checkpoint"].nunique()
     return last
 

@@ -37,23 +37,38 @@ def probability_better(successes_a: float, episodes_a: int, successes_b: float, 
     return float(np.clip(np.trapezoid(b.cdf(GRID) * a.pdf(GRID), GRID), 0.0, 1.0))
 
 
-def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
-    """Return the outcomes of the best setting, chosen on other episodes than those that are returned.
+def weights_elsewhere(solved: np.ndarray, count: int = 1) -> np.ndarray:
+    """Return the weights that average the best `count` settings, chosen on other episodes.
 
-    Outcomes are ``[settings, episodes]``. The even episodes choose the setting of the odd ones and vice
-    versa; among equals the first setting is chosen. So the choice does not bias the success rate.
+    Outcomes and weights are ``[settings, episodes]``. The even episodes choose the settings of the odd ones
+    and vice versa; among equals the first settings are chosen. So the choice does not bias the success rate.
+
+    Examples:
+        >>> import numpy as np
+        >>> from lab.statistics import weights_elsewhere
+        >>> # The first setting solves even episodes alone: they choose it for the odd ones.
+        >>> weights_elsewhere(np.array([[1, 0, 1, 0], [0, 1, 0, 1]])).tolist()
+        [[0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 1.0, 0.0]]
+    """
+    weights = np.zeros(solved.shape)
+    for part, other in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
+        # A single episode chooses for itself: there is no other.
+        judge = solved[:, other] if solved[:, other].size else solved
+        best = np.argsort(-judge.mean(1), kind="stable")[:count]
+        weights[best, part] = 1 / len(best)
+    return weights
+
+
+def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
+    """Return the outcomes of the best setting, see :func:`weights_elsewhere`.
 
     Examples:
         >>> import numpy as np
         >>> from lab.statistics import chosen_elsewhere
-        >>> # The first setting solves even episodes alone: they choose it, and it fails on the odd ones.
         >>> chosen_elsewhere(np.array([[1, 0, 1, 0], [0, 1, 0, 1]])).tolist()
-        [0, 0, 0, 0]
+        [0.0, 0.0, 0.0, 0.0]
     """
-    chosen = np.empty_like(solved[0])
-    for part, other in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
-        chosen[part] = solved[solved[:, other].mean(1).argmax(), part]
-    return chosen
+    return (weights_elsewhere(solved) * solved).sum(0)
 
 
 def resampled_means(tasks: Sequence[tuple[Sequence[int], int]], rng: np.random.Generator) -> np.ndarray:

@@ -20,6 +20,7 @@ from lab.scripted import generate
 from lab.stored_options import from_record, recorded, stored_options
 from tests.benchmarks.script_parts import refused
 from tests.errors import raises
+from warmprior.envs.tasks import EVALUATION_SEED
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [
@@ -114,6 +115,16 @@ def test_an_option_that_a_file_lacks_is_no_default(tmp_path):
             path.write_text(json.dumps(damaged))
             with raises(ValueError, "options.json", f"--{name.replace('_', '-')}"):
                 stored_options(Options, path.parent, "a-study")
+
+
+def test_each_training_seed_has_start_states_of_its_own():
+    evaluation = PRESETS["cpu"].evaluation
+    starts = [evaluation.starts(seed) for seed in (0, 1, 2, 99_999)]
+    assert [len(seeds) for seeds in starts] == [50] * 4
+    assert len({seed for seeds in starts for seed in seeds}) == 200
+    assert all(EVALUATION_SEED <= seed < 2**32 for seeds in starts for seed in seeds)
+    with raises(ValueError, "--episodes", "10,000", 10_001):
+        replace(evaluation, episodes=10_001)
 
 
 def test_counts_that_could_not_be_listed(tmp_path):

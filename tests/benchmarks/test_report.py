@@ -98,13 +98,14 @@ def test_a_summary_is_what_scipy_and_counting_say(top_k):
     for (data, prior, nfe), record in found.iterrows():
 
         def solved(prior, data=data, nfe=nfe):
-            """Of every seed the mean outcome of each episode, over the best checkpoints; ``[3, 6]``."""
-            seeds = []
-            for seed in range(3):
+            """Return the mean outcome of each episode over the best checkpoints of a seed, ``[3, 6]``."""
+            seeds = np.empty((3, 6))
+            for seed, e in itertools.product(range(3), range(6)):
                 texts = [episodes[prior, data, seed, c, nfe] for c in (100, 60, 30)]
-                best = sorted(texts, key=lambda text: -text.count("1"))[:top_k]
-                seeds.append(np.mean([[int(x) for x in text] for text in best], 0))
-            return np.array(seeds)
+                # Episodes of the other parity choose the checkpoints.
+                best = sorted(texts, key=lambda text: -text[1 - e % 2 :: 2].count("1"))[:top_k]
+                seeds[seed, e] = np.mean([int(text[e]) for text in best])
+            return seeds
 
         mine, first = solved(prior), solved("gaussian")
         k, b = mine.sum(), first.sum()
@@ -237,11 +238,16 @@ def test_a_table_has_the_mean_and_deviation_of_every_group_in_the_order_of_the_r
 
 
 def test_a_training_is_shown_by_its_best_checkpoints():
-    rates = {50: 9, 100: 3, 150: 6}
-    rows = [row(k, checkpoint=n, iterations=150, boundary_jump=n / 100) for n, k in rates.items()]
+    """The even episodes choose the checkpoint of the odd ones, and the other way round."""
+    outcomes = {50: "1111111110", 100: "1010101010", 150: "0101010111"}
+    rows = [row(text, checkpoint=n, iterations=150, boundary_jump=n / 100) for n, text in outcomes.items()]
+    (found,) = report.per_seed(pd.DataFrame(rows), 1).to_dict("records")
+    # Even episodes: 5, 5 and 1 solved, and the later of two equals is taken. Odd ones: 4, 0 and 5.
+    assert found["solved"].tolist() == [int(outcomes[150 if e % 2 == 0 else 100][e]) for e in range(10)]
+    assert found["checkpoints"] == 3 and found["boundary_jump"] == pytest.approx((1.0 + 1.5) / 2)
+    assert found["success"] == found["success_rate"] == pytest.approx(0.1)
     (found,) = report.per_seed(pd.DataFrame(rows), 2).to_dict("records")
-    assert found["checkpoints"] == 3 and found["boundary_jump"] == pytest.approx((0.5 + 1.5) / 2)
-    assert found["success"] == found["success_rate"] == pytest.approx((9 + 6) / 20)
+    assert found["boundary_jump"] == pytest.approx(((0.5 + 1.0) + (0.5 + 1.5)) / 4)
 
 
 def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):

@@ -6,7 +6,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.statistics import bootstrap_ratio, chosen_elsewhere, paired_probability_better, probability_better
+from lab.statistics import (
+    bootstrap_ratio,
+    chosen_elsewhere,
+    paired_probability_better,
+    probability_better,
+    weights_elsewhere,
+)
 from tests.errors import raises
 
 
@@ -61,12 +67,17 @@ def test_paired_probability_is_that_of_a_beta(wins, losses):
 
 
 def test_what_is_chosen_elsewhere_gains_nothing_by_chance():
-    """The best of equally good settings looks better on all episodes; the chosen one does not."""
+    """The best of equally good settings looks better on all episodes; the chosen ones do not."""
     rng = np.random.default_rng(0)
     solved = (rng.random((2_000, 3, 50)) < 0.5).astype(int)
     chosen = np.array([chosen_elsewhere(each).mean() for each in solved])
     assert solved.mean(2).max(1).mean() > 0.54
     assert abs(chosen.mean() - 0.5) < 0.006  # four standard errors
+    # The paper averages the best 3 of 10 checkpoints.
+    solved = (rng.random((2_000, 10, 50)) < 0.5).astype(int)
+    chosen = [(weights_elsewhere(each, 3) * each).sum(0).mean() for each in solved]
+    assert np.sort(solved.mean(2), 1)[:, -3:].mean() > 0.54
+    assert abs(np.mean(chosen) - 0.5) < 0.006
     # A setting that is better is found.
     better = (rng.random((2_000, 3, 50)) < np.array([0.2, 0.8, 0.2])[:, None]).astype(int)
     assert abs(np.mean([chosen_elsewhere(each).mean() for each in better]) - 0.8) < 0.006
