@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,10 +17,17 @@ from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.modules.trend import VARIANCE_FLOOR, PoseTrend
+from warmprior.modules.trend import VARIANCE_FLOOR, PoseTrend, vector_of
 
 CORRELATION_LIMIT = 1 - 1e-6
 """The largest correlation; above it source and target determine each other."""
+
+RIDGE = 1e-5
+"""The penalty of the regression on the observation, in units of its normalised entries."""
+
+Slope = Literal["marginal", "conditional"]
+
+_SECOND = ("source_variance", "target_variance", "covariance")
 
 
 class SourceMoments(nn.Module):
@@ -36,6 +43,7 @@ class SourceMoments(nn.Module):
         source_variance: :math:`v_0`.
         target_variance: :math:`v_1`.
         covariance: :math:`c = Cov(a_0, a_1)`.
+        given: :math:`v_0`, :math:`v_1` and :math:`c` given the observation; by default those over all data.
 
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
@@ -53,7 +61,10 @@ class SourceMoments(nn.Module):
         [True, True, True, True, False, False, False, False]
     """
 
-    positive = ("source_variance", "target_variance", "conditional_deviation")
+    positive = (
+        *("source_variance", "target_variance", "conditional_deviation"),
+        *("given_source_variance", "given_target_variance", "given_conditional_deviation"),
+    )
 
     def __init__(
         self,
@@ -62,27 +73,27 @@ class SourceMoments(nn.Module):
         source_variance: Tensor,
         target_variance: Tensor,
         covariance: Tensor,
+        *,
+        given: Sequence[Tensor] | None = None,
     ) -> None:
         super().__init__()
-        moments = (source_mean, target_mean, source_variance, target_variance, covariance)
+        second = (source_variance, target_variance, covariance)
+        moments = (source_mean, target_mean, *second, *(given or ()))
         shapes = [tuple(value.shape) for value in moments]
         if len(set(shapes)) > 1 or source_mean.ndim != 2:
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
         if not all(bool(torch.isfinite(value).all()) for value in moments):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
-        v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance))
-        limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
-        c = covariance.double().clamp(-limit, limit)
-        # The target's deviation given the source, in float64: lower precisions would lose the difference.
-        q = (v1 - c.square() / v0).sqrt()
-
-        def kept(value: Tensor) -> nn.Buffer:
-            # A copy, so that a tensor given twice does not become one buffer under two names.
-            return nn.Buffer(value.to(source_mean.dtype, copy=True))
-
-        self.source_mean, self.target_mean = kept(source_mean), kept(target_mean)
-        self.source_variance, self.target_variance = kept(v0), kept(v1)
-        self.covariance, self.conditional_deviation = kept(c), kept(q)
+        # Copies, so that a tensor given twice does not become one buffer under two names.
+        self.source_mean, self.target_mean = (nn.Buffer(mean.clone()) for mean in moments[:2])
+        for prefix, (source, target, covariance) in (("", second), ("given_", given or second)):
+            v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source, target))
+            limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
+            c = covariance.double().clamp(-limit, limit)
+            # The target's deviation given the source, in float64: lower precisions would lose the difference.
+            q = (v1 - c.square() / v0).sqrt()
+            for name, value in zip((*_SECOND, "conditional_deviation"), (v0, v1, c, q), strict=True):
+                self.register_buffer(prefix + name, value.to(source_mean.dtype))
 
     def config(self) -> None:
         """Return nothing: the values are buffers, and replace those of :meth:`identity`."""
@@ -103,6 +114,7 @@ class SourceMoments(nn.Module):
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         samples: int = 16_384,
         trend: PoseTrend | None = None,
+        slope: Slope = "marginal",
         observation_key: NestedKey = keys.OBSERVATION,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
@@ -117,6 +129,8 @@ class SourceMoments(nn.Module):
             coupling: how the training pairs sources and targets, see :data:`~warmprior.Coupling`.
             samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
+            slope: ``"conditional"`` also estimates moments given the observation: those of what a ridge
+                regression on the observation (its vector, if it has images) leaves of source and target.
             observation_key: key of the policy's observation, which the prior, coupling or trend may read.
             generator: draws the source samples, on the windows' device.
 
@@ -157,11 +171,32 @@ class SourceMoments(nn.Module):
             return (weight * values).sum(0) / count.clamp_min(1)
 
         m0, m1 = mean(a0), mean(a1)
-        v0, v1 = mean((a0 - m0).square()), mean((a1 - m1).square())
-        c = mean((a0 - m0) * (a1 - m1))
         unpadded = (count > 0).expand_as(m0)
-        v0, v1 = (torch.where(unpadded, value, 1.0) for value in (v0, v1))
-        return cls(*(value.to(torch.get_default_dtype()) for value in (m0, m1, v0, v1, c)))
+
+        def second(r0: Tensor, r1: Tensor) -> list[Tensor]:
+            v0, v1 = (torch.where(unpadded, mean(r.square()), 1.0) for r in (r0, r1))
+            return [value.to(torch.get_default_dtype()) for value in (v0, v1, mean(r0 * r1))]
+
+        a0, a1 = a0 - m0, a1 - m1
+        given = (
+            second(*_unexplained(vector_of(observation), weight, a0, a1)) if slope == "conditional" else None
+        )
+        means = (value.to(torch.get_default_dtype()) for value in (m0, m1))
+        return cls(*means, *second(a0, a1), given=given)
+
+
+def _unexplained(observation: Tensor, weight: Tensor, *ends: Tensor) -> list[Tensor]:
+    """Return what a ridge regression on observations ``[N, To, d_o]`` leaves of chunks ``[N, P, d_a]``."""
+    x = observation.double().flatten(1)
+    x = torch.cat((x, torch.ones_like(x[:, :1])), 1)
+    # Padded positions repeat the last action. Their zero weight leaves them out, position by position.
+    gram = torch.einsum("npi,nd,ne->pde", weight, x, x)
+    gram = gram + RIDGE * len(x) * torch.eye(x.shape[1], dtype=x.dtype, device=x.device)
+    predicted = (
+        torch.einsum("nd,pdi->npi", x, torch.linalg.solve(gram, torch.einsum("nd,npi->pdi", x, weight * end)))
+        for end in ends
+    )
+    return [end - value for end, value in zip(ends, predicted, strict=True)]
 
 
 class PreconditionedNetwork(VelocityNetwork):
@@ -176,7 +211,9 @@ class PreconditionedNetwork(VelocityNetwork):
         F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
 
     The first two terms predict the velocity linearly from :math:`a_t`; the input and the target of :math:`F`
-    have mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal if :math:`(a_0,
+    have mean 0 and variance 1 at every time and for every source. If the moments have values given the
+    observation, the slope is :math:`Cov(u_t, a_t | o) / Var(a_t | o)` instead, and the unit of :math:`F` the
+    standard deviation, over all data, of what this line leaves. :math:`F = 0` is optimal if :math:`(a_0,
     a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
     Eq. 7), whose constants assume zero means and an independent source.
 
@@ -251,42 +288,49 @@ class PreconditionedNetwork(VelocityNetwork):
 
     def remainder(self, t: Tensor) -> Tensor:
         """Return the unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
-        coefficients = self.interpolant.coefficients(t[:, None, None])
-        return self._remainder(*coefficients) * self._scale(*coefficients[:2])
+        return self._linear(*self.interpolant.coefficients(t[:, None, None]))[2]
 
-    def _scale(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """Return one over the standard deviation of the point."""
-        moments = self.moments
-        s0 = moments.source_variance.sqrt()
-        # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
-        along = _combination(s0, alpha, moments.covariance / s0, beta)
-        across = beta * moments.conditional_deviation
-        return torch.addcmul(along * along, across, across).rsqrt()
+    def _linear(
+        self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the slope of the velocity, one over the point's deviation, and the unit of ``F``.
 
-    def _remainder(self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor) -> Tensor:
-        """Return the remainder times the standard deviation of the point."""
-        s0 = self.moments.source_variance.sqrt()
-        return (alpha * d_beta - d_alpha * beta).abs() * (s0 * self.moments.conditional_deviation)
+        The unit has two parts: what the best slope over all data leaves, and what the chosen one adds.
+        """
+
+        def moments(prefix: str) -> tuple[Tensor, Tensor, Tensor]:
+            v0, v1, c, q = (
+                getattr(self.moments, prefix + name) for name in (*_SECOND, "conditional_deviation")
+            )
+            s0 = v0.sqrt()
+            # a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
+            along, across = _combination(s0, alpha, c / s0, beta), beta * q
+            scale = torch.addcmul(along * along, across, across).rsqrt()
+            covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
+            covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
+            return (
+                covariance * scale * scale,
+                scale,
+                (alpha * d_beta - d_alpha * beta).abs() * (s0 * q) * scale,
+            )
+
+        best, scale, remainder = moments("")
+        slope = moments("given_")[0]
+        return slope, scale, torch.hypot(remainder, (best - slope) / scale)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
-        moments = self.moments
-        m0, m1, c = moments.source_mean, moments.target_mean, moments.covariance
-        v0, v1 = moments.source_variance, moments.target_variance
+        m0, m1 = self.moments.source_mean, self.moments.target_mean
         if self.trend is not None:
             source, target = self.trend(observation)
             m0, m1 = m0 + source, m1 + target
-        scale = self._scale(alpha, beta)
+        slope, scale, unit = self._linear(alpha, beta, d_alpha, d_beta)
         centred = torch.addcmul(torch.addcmul(a, alpha, m0, value=-1), beta, m1, value=-1)
-        standardised = centred * scale
-        covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
-        covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
-        remainder = self._remainder(alpha, beta, d_alpha, d_beta)
-        learnt = self.network(t, standardised, observation)
-        velocity = torch.addcmul(covariance * standardised, remainder, learnt)
-        return torch.addcmul(_combination(m0, d_alpha, m1, d_beta), scale, velocity)
+        learnt = self.network(t, centred * scale, observation)
+        velocity = torch.addcmul(slope * centred, unit, learnt)
+        return velocity + _combination(m0, d_alpha, m1, d_beta)
 
 
 def _combination(x: Tensor, x_weight: Tensor, y: Tensor, y_weight: Tensor) -> Tensor:

@@ -198,7 +198,7 @@ class PoseTrend(nn.Module):
         The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
         draws the source samples, on the windows' device.
         """
-        resting = rest(_vector(windows[keys.OBSERVATION])[:, -1].float()).double()
+        resting = rest(vector_of(windows[keys.OBSERVATION])[:, -1].float()).double()
         centre = resting.mean(0)
         source = prior.distribution(windows[keys.HISTORY], windows[keys.OBSERVATION])
         draws = [source.sample(generator).double() for _ in range(DRAWS)]
@@ -222,10 +222,12 @@ class PoseTrend(nn.Module):
         observations with images.
         """
         # The resting action is in the precision of its units, which a cast does not lower.
-        deviation = (self.rest(_vector(observation)[:, -1]) - self.centre).to(self.source.dtype).unsqueeze(1)
+        deviation = (
+            (self.rest(vector_of(observation)[:, -1]) - self.centre).to(self.source.dtype).unsqueeze(1)
+        )
         return deviation * self.source, deviation * self.target
 
 
-def _vector(observation: Tensor | TensorDictBase) -> Tensor:
+def vector_of(observation: Tensor | TensorDictBase) -> Tensor:
     """Return the observation, or its state if it has images; an encoder's features begin with the state."""
     return observation[keys.STATE] if isinstance(observation, TensorDictBase) else observation

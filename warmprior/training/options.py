@@ -26,6 +26,7 @@ from warmprior.modules import (
     VisionNetwork,
 )
 from warmprior.modules.encoder import load_imagenet
+from warmprior.modules.preconditioning import Slope
 from warmprior.objectives.flow_matching import Objective, Weighting
 from warmprior.objectives.times import TimesName
 
@@ -53,6 +54,8 @@ class NetworkOptions:
             task; adaln_transformer is a faster transformer (adaptive layer norm).
         hidden_dim: width of the network; the class's own by default.
         precondition: use the second moments of source and data, see PreconditionedNetwork.
+        slope: slope of preconditioning's linear part: over all data (marginal), or given the observation
+            (conditional).
         observation_steps: To, observations per decision.
         observation_layers: transformers only; hidden layers of the network that reads all To observations
             together; by default 1 in adaln_transformer, and 0 in chi_transformer, which embeds each alone.
@@ -75,6 +78,7 @@ class NetworkOptions:
     network: Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"] = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
+    slope: Slope = "marginal"
     observation_steps: int = 2
     observation_layers: int | None = None
     time_frequency: float | None = None
@@ -87,6 +91,7 @@ class NetworkOptions:
         check_whole_numbers(**given(hidden_dim=self.hidden_dim))
         check_choice("network", self.network, _NETWORKS)
         check_choice("encoder", self.encoder, get_args(Encoder))
+        check_choice("slope", self.slope, get_args(Slope))
         check_whole_numbers(0, **given(observation_layers=self.observation_layers))
         check_positive(**given(time_frequency=self.time_frequency))
         for name in self._of_transformers():

@@ -20,7 +20,7 @@ from warmprior.io.distributed import from_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
+from warmprior.modules.preconditioning import PreconditionedNetwork, Slope, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.flow_matching import Coupling
@@ -58,6 +58,7 @@ def new_policy(
             coupling=coupling,
             withhold=training.cold_probability,
             rest=copy.deepcopy(task.rest),
+            slope=network.slope,
         )
     return WarmPriorActor(
         velocity,
@@ -216,6 +217,7 @@ def precondition(
     coupling: Coupling | None = None,
     withhold: float = 0.0,
     rest: RestingAction | None = None,
+    slope: Slope = "marginal",
 ) -> PreconditionedNetwork:
     """Wrap a network in a :class:`~warmprior.PreconditionedNetwork` for a prior and demonstrations.
 
@@ -231,6 +233,7 @@ def precondition(
             ``interpolant``, if it has one, or linear.
         withhold: share of the windows whose history is withheld.
         rest: the resting action, for absolute actions; the network then learns the motion from there.
+        slope: slope of the linear part, see :meth:`SourceMoments.fit`.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
@@ -256,6 +259,8 @@ def precondition(
     if rest is not None:
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
         trend = PoseTrend.fit(batch, prior, rest, generator=generator)
-    moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
+    moments = SourceMoments.fit(
+        windows, prior, coupling=coupling, trend=trend, slope=slope, generator=generator
+    )
     path = getattr(coupling, "interpolant", None)
     return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=path)
