@@ -54,17 +54,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
     ),
     "seeds": ("d", "training seeds"),
     "checkpoints": ("d", "checkpoints per training"),
-    "low": (
-        ".1%",
-        "lower end of the 95% interval of the success rate (the same checkpoints, Beta posterior)",
-    ),
-    "high": (".1%", "upper end of the 95% interval of the success rate"),
     "gain": ("+.1%", "success minus the first method's at the same NFE"),
+    "gains": ("", "the gain of each training"),
     "one_sigma": ("", "true if the gain exceeds the sum of both deviations over seeds (the paper's rule)"),
-    "better": (".2f", "probability of a higher success rate than the first method's, from unpaired episodes"),
     "won": (".6g", "episodes that this method solves and the first one does not, at equal seeds"),
     "lost": (".6g", "episodes that the first method solves and this one does not, at equal seeds"),
-    "paired": (".2f", "probability that this method wins an episode that only one of the two solves"),
     "paper": (".1%", "the paper's success rate, on the official demonstrations"),
     "paper_ratio": (".3f", "the paper's ratio of curvatures, on the official demonstrations"),
     "mean_steps": (".1f", "control steps per episode"),
@@ -115,7 +109,8 @@ ENDS = {
     "_executed": "over the executed positions",
     "shifted_": "with the history shifted",
     "_std": "standard deviation over training seeds",
-    "_low": "lower end of the 95% interval",
+    # Of success and gain by the spread between trainings; with one training each for its episodes alone.
+    "_low": "lower end of the 95% interval over trainings",
     "_high": "upper end of the 95% interval",
     "_ratio": "divided by the first method's",
 }

@@ -105,6 +105,7 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
     """Draw posteriors of the success rate as violins (appendix A); rows of a method and group are pooled.
 
     The width at height p is the density Beta(k + 1, n - k + 1), and the tick is its mean. k/n is below.
+    Pooled episodes spread less than trainings do, so a dot shows each training.
     """
     names = rows[group].map(lambda value: value if isinstance(value, str) else f"{group.upper()} {value}")
     rows = rows.assign(group=names)
@@ -118,8 +119,10 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
         half = 0.42 * density / density.max()
         axis.fill_betweenx(grid, x - half, x + half, alpha=0.75, lw=0, **look)
         axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
+        if len(violin) > 1:
+            axis.plot([x] * len(violin), violin["success_rate"], ".", color="black", ms=5)
         axis.text(x, -0.025, f"{k:.4g}/{n}", ha="center", va="top", fontsize=7, color="0.35")
-    dress(axis, y="success rate (posterior density)")
+    dress(axis, y="success rate (posterior density; dots: trainings)")
     axis.set_ylim(-0.08, 1.0)
     save(figure, path, title)
 

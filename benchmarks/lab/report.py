@@ -24,8 +24,7 @@ from lab.options import Options, with_parts
 from lab.paper import paper_success
 from lab.presets import IMAGES
 from lab.rows import read_rows
-from lab.statistics import paired_probability_better, probability_better, weights_elsewhere
-from warmprior.diagnostics import success_posterior
+from lab.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, spread_of, weights_elsewhere
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
 
@@ -33,7 +32,7 @@ FACTS = ["task", "data", "prior", "options", "sigma", "chunk"]  # columns that d
 RELATIVE = ["kappa", "relative_curvature", "bound", "training_seconds"]  # also shown as ratios
 BOUNDS = {"source_leak": LEAK_BOUND, "inner_step_ratio": INNER_STEP_BOUND}  # values above are marked (!)
 SHOWN = [  # columns below the success rates of report.md
-    *("success", "better", "won", "lost", "paired", *BOUNDS, "memory_gain", "boundary_jump", "inner_jump"),
+    *("success", "gain", "won", "lost", *BOUNDS, "memory_gain", "boundary_jump", "inner_jump"),
     *(f"{name}_ratio" for name in RELATIVE),
     *("coverage", "mean_error", "mean_revision_data", "mean_revision"),
 ]
@@ -142,12 +141,25 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     spread = groups[measures].std().dropna(axis=1, how="all").add_suffix("_std")
     result = groups[[*FACTS, "checkpoints"]].first().join(groups[["episodes", "successes"]].sum())
     result = result.assign(seeds=groups.size()).join(groups[measures].mean()).join(spread).reset_index()
-    counts = result[["successes", "episodes"]].to_numpy()
-    intervals = [success_posterior(*pair).interval(0.95) for pair in counts]
-    result["low"], result["high"] = zip(*intervals, strict=True)
+    result = result.join(groups["solved"].agg(list), on=keys)
+    result = result.join(_intervals(result, keys, "solved").clip(0.0, 1.0).add_prefix("success_"))
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
     result["paper"] = [paper_success(row) for row in firsts]
-    return _beside(result, seeds, keys)
+    return _beside(result, seeds, keys).drop(columns="solved")
+
+
+def _intervals(rows: DataFrame, keys: Sequence[str], name: str) -> DataFrame:
+    """Return the `low` and `high` ends of the mean of a column whose entries are a list, one per training.
+
+    Rows that were played alike tell together how much trainings differ: those of all settings and methods.
+    """
+    played = [key for key in keys if key not in ("setting", "method")]
+    ends = DataFrame(math.nan, rows.index, ["low", "high"])
+    for _, group in rows[rows[name].notna()].groupby(played, dropna=False):
+        cells = group[name].map(np.stack)
+        spread = spread_of(list(cells))
+        ends.loc[group.index] = [interval([cell], spread) for cell in cells]
+    return ends
 
 
 def _by_temperature(rows: DataFrame) -> bool:
@@ -172,24 +184,21 @@ def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame
     rows["gain"] = (rows["success"] - first_rows["success"]).where(other)
     deviations = [part.get("success_std", math.nan) for part in (rows, first_rows)]
     rows["one_sigma"] = rows["gain"] > deviations[0] + deviations[1]
-    counted = ["successes", "episodes"]
-    pairs = rows[counted].join(first_rows[counted].add_suffix("_first"))
-    rows["better"] = [
-        probability_better(*counts) if not math.isnan(gain) else math.nan
-        for counts, gain in zip(pairs.to_numpy(), rows["gain"], strict=True)
-    ]
     # Episodes are paired by their seeds, and trainings by theirs.
     both = seeds[seeds["method"] != first].merge(
         seeds[seeds["method"] == first], on=[*place, "seed"], suffixes=("", "_first")
     )
-    differences = [one - first for one, first in both[["solved", "solved_first"]].to_numpy()]
-    both["won"] = [pairs.clip(min=0).sum() for pairs in differences]
-    both["lost"] = [-pairs.clip(max=0).sum() for pairs in differences]
-    rows = rows.join(both.groupby(list(keys))[["won", "lost"]].sum(), on=list(keys))
-    rows["paired"] = [
-        math.nan if math.isnan(won) else paired_probability_better(won, lost)
-        for won, lost in rows[["won", "lost"]].to_numpy()
+    both["differences"] = [one - first for one, first in both[["solved", "solved_first"]].to_numpy()]
+    both["won"] = [pairs.clip(min=0).sum() for pairs in both["differences"]]
+    both["lost"] = [-pairs.clip(max=0).sum() for pairs in both["differences"]]
+    compared = both.groupby(list(keys))
+    rows = rows.join(compared[["won", "lost"]].sum(), on=list(keys))
+    rows = rows.join(compared["differences"].agg(list), on=list(keys))
+    rows = rows.join(_intervals(rows, keys, "differences").add_prefix("gain_"))
+    rows["gains"] = [
+        [float(pairs.mean()) for pairs in of] if isinstance(of, list) else [] for of in rows["differences"]
     ]
+    rows = rows.drop(columns="differences")
     # A flow does not depend on NFE, and the first method may not be played at this one.
     flows = seeds[seeds["method"] == first].groupby("setting")[RELATIVE].mean()
     for name in RELATIVE:
@@ -278,13 +287,13 @@ def _experiment(rows: DataFrame, top_k: int) -> str:
 
 
 def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
-    """Return three lines: the experiment, the best methods, and the probability that they beat the first.
+    """Return three sentences: the experiment, the best methods, and whether their gain can be chance.
 
-    Over several settings, success is averaged and episodes are pooled.
+    Over several settings, success is averaged, and trainings are taken together.
     """
     first, settings = baseline(rows), rows["setting"].unique()
     best, chances = [], []
-    sums = {"success": "mean", "successes": "sum", "episodes": "sum", "task": "size"}
+    sums = {"success": "mean", "gains": "sum", "task": "size"}  # a sum of lists joins them
     for nfe, group in _placed(rows).sort_values("nfe", ascending=False).groupby("column", sort=False):
         totals = group.sort_index().groupby("method", sort=False).agg(sums)
         totals = totals[totals["task"] == totals["task"].max()]  # methods that were played in all settings
@@ -293,17 +302,27 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
         others = totals.drop(first, errors="ignore")
         if first in totals.index and len(others):
             name = others["success"].idxmax()
-            counts = totals.loc[[name, first], ["successes", "episodes"]].to_numpy().flatten()
             gain = totals.loc[name, "success"] - totals.loc[first, "success"]
-            chance = probability_better(*counts)
-            chances.append(f"{name} {gain:+.1%}, {chance:.2f} at {nfe}")
+            chances.append(f"{name} {gain:+.1%} at {nfe} ({verdict(totals.loc[name, 'gains'])})")
     where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
     lines = [
         f"{_count(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
         f"Best success: {'; '.join(best)}.",
-        f"Gain over {first} and its probability: {'; '.join(chances) or 'nothing to compare'}.",
+        f"Gain over {first}: {'; '.join(chances) or 'nothing to compare'}.",
     ]
-    return "\n".join(textwrap.shorten(line, width, placeholder=" ...") for line in lines)
+    return "\n".join(textwrap.fill(line, width, subsequent_indent="  ") for line in lines)
+
+
+def verdict(gains: Sequence[float]) -> str:
+    """Return in words whether the gains of several trainings can be chance.
+
+    >>> verdict([0.1, 0.2, 0.1, 0.3, 0.2, 0.1]), verdict([0.1])
+    ('p = 0.031, 6 trainings', '1 training, too few to judge')
+    """
+    count = _count(len(gains), "training")
+    if len(gains) < ENOUGH_TRAININGS:
+        return f"{count}, too few to judge"
+    return f"p = {sign_flip_test(gains):.2g}, {count}"
 
 
 def terminal_table(results: DataFrame, top_k: int, width: int = 120) -> str:
@@ -336,7 +355,10 @@ def success_report(
     frame = frame[(frame.iloc[:, 1:] != "-").any(axis=1)]
     rule = "`*` marks a gain above the sum of both standard deviations over seeds (the paper's rule)."
     if rows["seeds"].max() == 1:
-        rule = "One seed has no spread, so no gain is marked. success.png shows the posterior over episodes."
+        rule = (
+            "One training per method does not tell how much trainings differ: no gain is marked, and "
+            "intervals are for other episodes of the same policies alone. For more, add --seeds 3."
+        )
     head = f"{_experiment(results, top_k)}. In parentheses: the gain over {first} in points. Bold: the best."
     listed = [head, rule, *notes]
     if source not in ("official", None):

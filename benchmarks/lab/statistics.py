@@ -1,40 +1,22 @@
-"""Statistics of a report: comparisons of success rates, and intervals of ratios."""
+"""Statistics of a report: intervals and comparisons that count trainings, and intervals of ratios."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import bootstrap
+from scipy.stats import bootstrap, norm, permutation_test
+from scipy.stats import t as student_t
 from torch import Tensor
-
-from warmprior.diagnostics import success_posterior
 
 RESAMPLES = 2_000
 """Number of draws of a bootstrap."""
 
-
-GRID = np.linspace(0.0, 1.0, 20_001)
-"""Success rates over which :func:`probability_better` integrates."""
-
-
-def probability_better(successes_a: float, episodes_a: int, successes_b: float, episodes_b: int) -> float:
-    r"""Return the probability that ``a`` succeeds more often than ``b``, both under a uniform prior.
-
-    With :math:`p_a \sim \mathrm{Beta}(\alpha_a, \beta_a)` and the same for :math:`p_b`, as in
-    :func:`~warmprior.diagnostics.success_posterior`, it is :math:`\int f_a(x) F_b(x) \, dx`. Successes may be
-    means over several checkpoints that played the same episodes. Pooled episodes of several training seeds
-    are not quite independent; the probability is then too extreme.
-
-    Examples:
-        >>> from lab.statistics import probability_better
-        >>> round(probability_better(18, 20, 12, 20), 3), round(probability_better(0, 0, 0, 0), 3)
-        (0.984, 0.5)
-    """
-    a, b = success_posterior(successes_a, episodes_a), success_posterior(successes_b, episodes_b)
-    return float(np.clip(np.trapezoid(b.cdf(GRID) * a.pdf(GRID), GRID), 0.0, 1.0))
+ENOUGH_TRAININGS = 6
+"""The smallest number of trainings with which :func:`sign_flip_test` can be below 0.05."""
 
 
 def weights_elsewhere(solved: np.ndarray, count: int = 1) -> np.ndarray:
@@ -71,54 +53,101 @@ def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
     return (weights_elsewhere(solved) * solved).sum(0)
 
 
-def resampled_means(tasks: Sequence[tuple[Sequence[int], int]], rng: np.random.Generator) -> np.ndarray:
-    """Return bootstrap draws of a mean success rate over tasks, ``[RESAMPLES]``.
+@dataclass(frozen=True)
+class Spread:
+    """How far success rates vary, in units of the variance of independent episodes.
 
-    A draw takes training seeds with replacement, task by task, and then episodes of each. Every task has the
-    same weight. With several seeds the draws spread somewhat too far, because the rates of seeds already
-    contain the chance of their episodes; with one seed they spread too little, because differences between
-    seeds are left out.
-    rliable (Agarwal et al. 2021) resamples seeds in the same way, but not episodes.
+    A training succeeds more or less often than another, so episodes of one training are alike. The design
+    effect of trainings (Kish, 1965) is the variance of their rates over that of independent episodes.
+    If all trainings play the same starts, episodes of one start are alike too, and have an effect as well.
 
-    Args:
-        tasks: per task the number of episodes that each training seed solved, and that each played.
-        rng: source of randomness.
+    Attributes:
+        trainings: the design effect of trainings; 1 if unknown.
+        starts: the design effect of shared starts, at least 1; 1 if each training has its own.
+        freedom: degrees of freedom of the estimate: trainings minus cells; 0 without any second training.
+    """
+
+    trainings: float
+    starts: float
+    freedom: int
+
+
+def spread_of(cells: Sequence[np.ndarray], shared_starts: bool = False) -> Spread:
+    """Return the spread of the episodes of several cells together, each ``[trainings, episodes]``.
+
+    A value is the outcome of an episode (1 if solved), or the difference of the outcomes of two methods that
+    played the same. Cells with few trainings tell more together than each alone.
 
     Examples:
         >>> import numpy as np
-        >>> from lab.statistics import resampled_means
-        >>> means = resampled_means([([25, 25, 25], 50), ([50, 50, 50], 50)], np.random.default_rng(0))
-        >>> round(float(means.mean()), 2), round(float(means.std()), 2)  # sqrt(0.5 * 0.5 / 150) / 2
-        (0.75, 0.02)
+        >>> from lab.statistics import spread_of
+        >>> outcomes = np.array([[1] * 40 + [0] * 10, [1] * 10 + [0] * 40])  # two trainings: 80 and 20%
+        >>> spread = spread_of([outcomes])
+        >>> round(spread.trainings), spread.freedom  # 50 (0.3^2 + 0.3^2) / 0.25
+        (36, 1)
     """
-    rates = []
-    for solved, episodes in tasks:
-        seeds = rng.choice(solved, (RESAMPLES, len(solved)))
-        rates.append(rng.binomial(episodes, seeds / episodes).mean(1) / episodes)
-    return np.mean(rates, axis=0)
+    by_training = by_start = 0.0
+    freedom = sum(len(cell) - 1 for cell in cells)
+    starts = sum(cell.shape[1] - 1 for cell in cells) if shared_starts else 0
+    for cell in cells:
+        n, m = cell.shape
+        # A cell without any variance says nothing of the spread.
+        if (variance := cell.var()) > 0:
+            by_training += m * ((cell.mean(1) - cell.mean()) ** 2).sum() / variance
+            by_start += n * ((cell.mean(0) - cell.mean()) ** 2).sum() / variance
+    return Spread(
+        float(by_training / freedom) if freedom else 1.0,
+        float(max(1.0, by_start / starts)) if starts else 1.0,
+        freedom,
+    )
 
 
-def paired_probability_better(wins: float, losses: float) -> float:
-    r"""Return the posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
+def interval(cells: Sequence[np.ndarray], spread: Spread, confidence: float = 0.95) -> tuple[float, float]:
+    """Return an interval of the mean over cells, each ``[trainings, episodes]``, with this spread.
 
-    Under a uniform prior the share of ``wins`` (episodes that ``a`` alone solves, :math:`w`) among these and
-    ``losses`` (that ``b`` alone solves, :math:`l`) is :math:`\mathrm{Beta}(w + 1, l + 1)`, which exceeds one
-    half with probability
-
-    .. math::
-        P = 2^{-(w + l + 1)} \sum_{i=0}^{w} \binom{w + l + 1}{i},
-
-    the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes of the
-    same seeds differ in difficulty.
-
-    If several checkpoints played the same episodes, an episode counts once, with the mean of its outcomes.
+    It is Student's interval for what other trainings and starts would give. Without a second training
+    (``spread.freedom = 0``) it is for other episodes of the same trainings alone, and so too narrow.
 
     Examples:
-        >>> from lab.statistics import paired_probability_better
-        >>> round(paired_probability_better(3, 0), 4), round(paired_probability_better(4, 4), 4)  # 15 / 16
-        (0.9375, 0.5)
+        >>> import numpy as np
+        >>> from lab.statistics import interval, spread_of
+        >>> outcomes = np.array([[1] * 20 + [0] * 30, [1] * 25 + [0] * 25, [1] * 30 + [0] * 20])
+        >>> low, high = interval([outcomes], spread_of([outcomes]))
+        >>> f"{low:.3f} {high:.3f}"  # rates of 0.4, 0.5 and 0.6: 0.5 -+ 4.303 * 0.1 / sqrt(3)
+        '0.252 0.748'
     """
-    return float(success_posterior(wins, wins + losses).sf(0.5))
+    effect = spread.trainings + spread.starts - 1
+    # One episode more of each kind, as in Wilson's interval: rates of 0 and 1 are not certain.
+    variances = [effect * max(cell.var(), 1 / (cell.size + 2)) / cell.size for cell in cells]
+    error = math.sqrt(sum(variances)) / len(cells)
+    quantile = (
+        student_t.ppf((1 + confidence) / 2, spread.freedom)
+        if spread.freedom
+        else norm.ppf((1 + confidence) / 2)
+    )
+    mean = float(np.mean([cell.mean() for cell in cells]))
+    return float(mean - quantile * error), float(mean + quantile * error)
+
+
+def sign_flip_test(differences: Sequence[float]) -> float:
+    """Return the two-sided p-value of a mean difference between two methods, over trainings.
+
+    If the methods are equal, a training's difference is as likely to have the other sign. The test compares
+    the mean with those of all signs, exactly up to 13 trainings and with 10,000 draws beyond. Three
+    trainings can never be below 0.25, six reach 0.03, and twelve 0.0005.
+
+    Examples:
+        >>> from lab.statistics import sign_flip_test
+        >>> sign_flip_test([0.1, 0.2, 0.3]), sign_flip_test([0.1, 0.2, 0.3, 0.1, 0.2, 0.1])
+        (0.25, 0.03125)
+    """
+    values = np.asarray(differences, dtype=float)
+    if not values.any():
+        return 1.0
+    result = permutation_test(
+        (values,), np.mean, permutation_type="samples", n_resamples=10_000, rng=np.random.default_rng(0)
+    )
+    return float(result.pvalue)
 
 
 def bootstrap_ratio(

@@ -39,8 +39,10 @@ def test_violins_and_bars_show_what_the_seeds_of_a_method_have_in_common(tmp_pat
     plots.plot_success(rows[rows["checkpoint"] == 100], tmp_path / "a.png", "t")
     ((axis,),) = figures
     assert texts(axis.texts) == ["15/30", "24/30", "15/30"] and texts(axis.get_xticklabels()) == ["NFE 1"]
-    means = [line.get_ydata()[0] for line in axis.get_lines()]
+    ticks, dots = axis.get_lines()[::2], axis.get_lines()[1::2]
+    means = [line.get_ydata()[0] for line in ticks]
     assert means == pytest.approx([16 / 32, 25 / 32, 16 / 32])  # of Beta(k + 1, n - k + 1)
+    assert [list(line.get_ydata()) for line in dots] == [[0.4, 0.5, 0.6], [0.7, 0.8, 0.9], [0.5] * 3]
     assert axis.get_legend_handles_labels()[1] == ["Gaussian source", "WP-Past", "WP-Preview"]
     image = imread(tmp_path / "a.png")[..., :3]  # nothing is cut off at the edges
     assert all((edge == 1).all() for edge in (image[:, :3], image[:, -3:], image[:3], image[-3:]))

@@ -7,7 +7,7 @@ import memory
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 
 from lab import report
 from lab.command_line import parse, started
@@ -108,25 +108,30 @@ def test_a_summary_is_what_scipy_and_counting_say(top_k):
             return seeds
 
         mine, first = solved(prior), solved("gaussian")
-        k, b = mine.sum(), first.sum()
         assert record["success"] == pytest.approx(mine.mean()) == record["successes"] / record["episodes"]
         assert record["success_std"] == pytest.approx(np.std(mine.mean(1), ddof=1))
         assert (record["seeds"], record["episodes"]) == (3, 18)
-        posterior = stats.beta(k + 1, 19 - k)
-        assert (record["low"], record["high"]) == pytest.approx(tuple(posterior.ppf([0.025, 0.975])))
+        # Student's interval: 12 trainings of 4 cells, whose spread is in units of each cell's variance.
+        cells = [solved(p, d) for p in ("gaussian", "past") for d in ("ph", "mh")]
+        effect = sum(6 * np.var(c.mean(1)) * 3 / np.var(c) for c in cells) / 8
+        half = stats.t(8).ppf(0.975) * np.sqrt(effect * max(np.var(mine), 1 / 20) / 18)
+        ends = np.clip([mine.mean() - half, mine.mean() + half], 0, 1)
+        assert (record["success_low"], record["success_high"]) == pytest.approx(tuple(ends))
         if prior == "gaussian":
-            assert record[["gain", "better", "won", "lost", "paired"]].isna().all()
+            assert record[["gain", "gain_low", "won", "lost"]].isna().all()
             continue
         spread = sum(np.std(part.mean(1), ddof=1) for part in (mine, first))
         assert record["gain"] == pytest.approx(mine.mean() - first.mean())
         assert record["one_sigma"] == (record["gain"] > spread)
-        other = stats.beta(b + 1, 19 - b)
-        better = integrate.quad(lambda p, a=posterior, b=other: a.pdf(p) * b.cdf(p), 0, 1)[0]
-        assert record["better"] == pytest.approx(better, abs=1e-6)
+        pairs = [solved("past", d) - solved("gaussian", d) for d in ("ph", "mh")]
+        effect = sum(6 * np.var(c.mean(1)) * 3 / np.var(c) for c in pairs) / 4
+        half = stats.t(4).ppf(0.975) * np.sqrt(effect * max(np.var(mine - first), 1 / 20) / 18)
+        ends = record["gain"] - half, record["gain"] + half
+        assert (record["gain_low"], record["gain_high"]) == pytest.approx(ends)
+        assert record["gains"] == pytest.approx(list((mine - first).mean(1)))
         won, lost = (np.clip(sign * (mine - first), 0, 1).sum() for sign in (1, -1))
         assert (record["won"], record["lost"]) == pytest.approx((won, lost))
         assert record["gain"] * record["episodes"] == pytest.approx(won - lost)
-        assert record["paired"] == pytest.approx(stats.beta(won + 1, lost + 1).sf(0.5))
 
 
 def test_a_first_method_that_failed_in_one_setting_stays_the_first():
@@ -135,7 +140,8 @@ def test_a_first_method_that_failed_in_one_setting_stays_the_first():
     rows += [row(k, prior=prior, task="can") for prior, k in (("gaussian", 5), ("past", 8), ("preview", 2))]
     found = report.summary(pd.DataFrame(rows), 1)
     assert list(found["gain"].round(9).dropna()) == [0.3, -0.3] and found["gain"][:3].isna().all()
-    assert found["better"].notna().tolist() == found["won"].notna().tolist() == [False] * 3 + [True] * 2
+    assert found["won"].notna().tolist() == [False] * 3 + [True] * 2
+    assert [len(gains) for gains in found["gains"]] == [0, 0, 0, 1, 1]
     for text in (report.headline(found, 1), report.terminal_table(found, 1), table(rows)):
         assert "ain over Gaussian source" in text and "ain over WP" not in text
 
@@ -146,8 +152,8 @@ def test_a_gain_and_its_probabilities_are_of_the_same_checkpoints():
     rows += [row(k, prior="past", checkpoint=c) for c, k in ((1, 9), (2, 9), (3, 1))]
     _, best = report.summary(pd.DataFrame(rows), 2).to_dict("records")
     _, every = report.summary(pd.DataFrame(rows), 3).to_dict("records")
-    assert best["gain"] == pytest.approx(0.5) and min(best["better"], best["paired"]) > 0.95
-    assert every["gain"] == pytest.approx(19 / 30 - 0.4) and every["better"] < best["better"]
+    assert best["gain"] == pytest.approx(0.5) == best["gains"][0]
+    assert every["gain"] == pytest.approx(19 / 30 - 0.4) == every["gains"][0]
 
 
 def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
@@ -170,12 +176,12 @@ def test_the_report_has_the_layout_of_table_1():
     assert cells_of(text, "Square-PH, paper") == [f"{rate}" for rate in SUCCESS["square", "ph", "state"][-3:]]
 
     def counts(text):
-        return [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
+        return [(line["won"], line["lost"]) for line in lines_of(text)]
 
-    assert counts(text) == [("-", "-", "-"), ("9", "0", "1.00"), ("1", "1", "0.50")]
+    assert counts(text) == [("-", "-"), ("9", "0"), ("1", "1")]
     # An episode that one of two checkpoints solves counts half.
     halves = pd.DataFrame([row("01"), row("11", prior="past"), row("01", prior="past", checkpoint=50)])
-    assert counts(table(halves, 2))[1] == ("0.5", "0", "0.65")  # 1 - 2^-1.5
+    assert counts(table(halves, 2))[1] == ("0.5", "0")
     assert "3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed" in text
     assert "- A note.\n" in text and "source_leak" not in text  # nobody measured it
 
@@ -197,14 +203,18 @@ def test_measures_are_of_the_chosen_checkpoints_beside_the_baseline():
 def test_the_terminal_table_fits_and_says_first_what_came_out():
     rows = [row(k, prior=p, nfe=9) for p, k in (("gaussian", 6), ("past", 4), ("preview", 5))]
     found = report.summary(pd.concat([compared(), pd.DataFrame(rows)], ignore_index=True), 1)
-    facts, best, sure, empty, *_ = report.terminal_table(found, 1).splitlines()
+    facts, best, *sure = report.headline(found, 1).splitlines()
+    assert report.terminal_table(found, 1).startswith("\n".join([facts, best, *sure, ""]))
     assert facts.endswith("H = 8, 3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed.")
-    assert best == "Best success: Gaussian source 60.0% at NFE 9; WP-Past 80.0% at NFE 1." and empty == ""
-    said = re.findall(r"(\S+ [+-]\d+\.\d%), (\S+) at NFE (\d)", sure)
-    chance = {(one["prior"], one["nfe"]): one["better"] for _, one in found.iterrows()}
-    assert [(gain, nfe) for gain, _, nfe in said] == [("WP-Preview -10.0%", "9"), ("WP-Past +30.0%", "1")]
-    expected = [chance["preview", 9], chance["past", 1]]
-    assert [float(one) for _, one, _ in said] == pytest.approx(expected, abs=0.006)
+    assert best == "Best success: Gaussian source 60.0% at NFE 9; WP-Past 80.0% at NFE 1."
+    sure = " ".join(sure).replace("  ", "")
+    said = re.findall(r"(\S+ [+-]\d+\.\d%) at NFE (\d) \((\d trainings?)", sure)
+    expected = [("WP-Preview -10.0%", "9", "1 training"), ("WP-Past +30.0%", "1", "3 trainings")]
+    assert said == expected and "p =" not in sure
+    # Together the trainings of two settings are enough: all six gain, which happens by chance in 2 of 64.
+    both = pd.concat([compared(), compared().assign(task="can", policy=lambda rows: rows.policy + "-can")])
+    sure = " ".join(report.headline(report.summary(both, 1), 1).split())
+    assert "WP-Past +30.0% at NFE 1 (p = 0.031, 6 trainings)" in sure
     names = [f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(14)]
     rows = [row(prior="past", options=o, nfe=n, task=t) for o in names for n in range(1, 10) for t in "ab"]
     text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)
@@ -264,9 +274,10 @@ def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
     argv = [str(tmp_path / name) for name in ("one", "two")]
     assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    assert lines[2:] == [
-        "| Square-PH | 100 | 1 | 1 | WP-Past | 0.250 | +20.0% |",  # the mean of 8 and 6 of 10, minus 5
-        "| Square-PH | 200 | 1 | 1 | WP-Past | 0.500 | +70.0% |",
+    starts = [line.partition(" [")[0] for line in lines[2:]]  # before the interval
+    assert starts == [
+        "| Square-PH | 100 | 1 | 1 | WP-Past | 0.250 | +20.0%",  # the mean of 8 and 6 of 10, minus 5
+        "| Square-PH | 200 | 1 | 1 | WP-Past | 0.500 | +70.0%",
     ]
     assert is_png(tmp_path / "a.png")
     # Two runs of a setting may differ in anything, so their gains are not averaged.

@@ -1,19 +1,21 @@
 import math
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from scipy import stats
+from scipy.special import expit, logit
 
 from lab.statistics import (
+    ENOUGH_TRAININGS,
     bootstrap_ratio,
     chosen_elsewhere,
-    paired_probability_better,
-    probability_better,
+    interval,
+    sign_flip_test,
+    spread_of,
     weights_elsewhere,
 )
-from tests.errors import raises
 
 
 def test_bootstrap_agrees_with_the_delta_method():
@@ -45,25 +47,101 @@ def test_bootstrap_draws_whole_groups():
     assert width(x.repeat(9), y.repeat(9), torch.arange(270)) < 0.5 * once
 
 
-@given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 60), st.integers(0, 60))
-def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, n_b):
-    np, stats = pytest.importorskip("numpy"), pytest.importorskip("scipy.stats")
-    k_a, k_b = min(k_a, n_a), min(k_b, n_b)
-    a, b = stats.beta(k_a + 1, n_a - k_a + 1), stats.beta(k_b + 1, n_b - k_b + 1)
-    nodes, weights = np.polynomial.legendre.leggauss(200)
-    p = (nodes + 1) / 2
-    expected = float((weights / 2 * a.pdf(p) * b.cdf(p)).sum())
-    assert probability_better(k_a, n_a, k_b, n_b) == pytest.approx(expected, abs=1e-5)
+def outcomes(rng, trainings=3, episodes=50, rate=0.4, shared=False, gap=0.0):
+    """Return outcomes of two methods that play the same starts, each ``[trainings, episodes]``.
+
+    Trainings and starts differ as in the published rows: rates of trainings by 3.5 points, and outcomes of an
+    episode correlate by .20 over trainings.
+    """
+    starts = rng.normal(0, 1, (1 if shared else trainings, episodes))
+
+    def played(rate):
+        own = rng.normal(0, 0.16, (trainings, 1))
+        chance = expit(logit(rate) * 1.2 + own + starts)
+        return (rng.random((trainings, episodes)) < chance).astype(float)
+
+    return played(rate), played(rate + gap)
 
 
-@pytest.mark.parametrize(("wins", "losses"), [(0, 0), (7, 2), (0, 5), (40, 41), (900, 100)])
-def test_paired_probability_is_that_of_a_beta(wins, losses):
-    stats = pytest.importorskip("scipy.stats")
-    found = paired_probability_better(wins, losses)
-    assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
-    assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
-    with raises(ValueError, "between 0"):
-        paired_probability_better(-1, losses)
+def expected(rate):
+    """Return the mean rate over trainings and starts, by quadrature over their normal sum."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+    return float((weights * expit(logit(rate) * 1.2 + math.hypot(1, 0.16) * nodes)).sum() / weights.sum())
+
+
+def test_an_interval_is_students_over_trainings():
+    """With one cell it is scipy's, and with several cells their spread is pooled."""
+    rng = np.random.default_rng(0)
+    cells = [outcomes(rng, 5, 20, rate)[0] for rate in (0.2, 0.5)]
+    rates = [cell.mean(1) for cell in cells]
+    alone = stats.ttest_1samp(rates[0], 0).confidence_interval(0.95)
+    assert interval(cells[:1], spread_of(cells[:1])) == pytest.approx((alone.low, alone.high))
+    # Pooled: each cell's squared deviations in units of its own variance, over 8 degrees of freedom.
+    units = [20 * 5 * r.var() / cell.var() for r, cell in zip(rates, cells, strict=True)]
+    error = math.sqrt(sum(cell.var() * sum(units) / 8 / 100 for cell in cells)) / 2
+    half, centre = stats.t(8).ppf(0.975) * error, np.mean(rates)
+    assert interval(cells, spread_of(cells)) == pytest.approx((centre - half, centre + half))
+
+
+def test_one_training_tells_of_its_episodes_alone_and_certainty_never():
+    rng = np.random.default_rng(1)
+    (cell, _), z = outcomes(rng, 1, 200), stats.norm.ppf(0.975)
+    half = z * math.sqrt(cell.mean() * (1 - cell.mean()) / 200)
+    assert spread_of([cell]).freedom == 0
+    assert interval([cell], spread_of([cell])) == pytest.approx((cell.mean() - half, cell.mean() + half))
+    perfect = np.ones((1, 50))
+    low, high = interval([perfect], spread_of([perfect]))
+    assert 0.9 < low < 1 < high
+
+
+def test_a_p_value_is_the_share_of_signs_that_are_as_far_from_zero():
+    differences = np.array([0.1, -0.04, 0.2, 0.06, 0.12, 0.02, 0.0])
+    signs = np.array(list(product((1, -1), repeat=7)))
+    means = (signs * differences).mean(1)
+    one_sided = (means >= differences.mean() - 1e-12).mean()
+    assert sign_flip_test(differences) == pytest.approx(2 * one_sided)
+    assert sign_flip_test(-differences) == pytest.approx(2 * one_sided)
+    smallest = {3: 0.25, ENOUGH_TRAININGS: 2**-5, 12: 2**-11}
+    for count, p in smallest.items():
+        assert sign_flip_test([0.1] * count) == pytest.approx(p)
+    assert sign_flip_test([0.0] * 6) == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("cells", "trainings"), [(4, 3), (1, 12), (7, 2)])
+def test_intervals_cover_what_other_trainings_would_give(shared, cells, trainings):
+    """Within two points of 95 in 100, for rates and for differences; the simulation's own error is 0.7."""
+    rng, rates = np.random.default_rng(0), np.linspace(0.2, 0.6, cells)
+    truth = np.mean([expected(rate) for rate in rates])
+    covered = []
+    for _ in range(1_000):
+        pairs = [outcomes(rng, trainings, 50, rate, shared) for rate in rates]
+        first, differences = [one for one, _ in pairs], [two - one for one, two in pairs]
+        for sample, value in (first, truth), (differences, 0.0):
+            low, high = interval(sample, spread_of(sample, shared))
+            covered.append(low <= value <= high)
+    for kind in covered[::2], covered[1::2]:
+        assert 0.93 <= np.mean(kind) <= 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [4, 1])
+def test_twelve_trainings_of_fifty_find_ten_points_and_raise_few_false_alarms(cells):
+    rng = np.random.default_rng(0)
+
+    def found(gap, repeats):
+        rejected = []
+        for _ in range(repeats):
+            pairs = [outcomes(rng, 12 // cells, 50, rate, gap=gap) for rate in np.linspace(0.25, 0.55, cells)]
+            rejected.append(sign_flip_test(np.concatenate([(b - a).mean(1) for a, b in pairs])) < 0.05)
+        return np.mean(rejected)
+
+    # The share of solved episodes grows by ten points where the rate at an average start grows by 0.1.
+    gap = np.mean([expected(rate + 0.1) - expected(rate) for rate in np.linspace(0.25, 0.55, cells)])
+    assert gap == pytest.approx(0.1, abs=0.01)
+    assert found(0.0, 500) <= 0.06
+    assert found(0.1, 200) >= 0.80
 
 
 def test_what_is_chosen_elsewhere_gains_nothing_by_chance():
