@@ -142,7 +142,7 @@ def sign_flip_test(differences: Sequence[float]) -> float:
         (0.25, 0.03125)
     """
     values = np.asarray(differences, dtype=float)
-    if not values.any():
+    if len(values) < 2 or not values.any():
         return 1.0
     result = permutation_test(
         (values,), np.mean, permutation_type="samples", n_resamples=10_000, rng=np.random.default_rng(0)

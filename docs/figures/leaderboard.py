@@ -4,8 +4,8 @@ The README's table has its means next to those on scripted demonstrations.
 
 PYTHONPATH=benchmarks python docs/figures/leaderboard.py    # or: make results; writes a picture and a table
 
-95% intervals are from a bootstrap over training seeds and episodes. A rank is among all lines of the table,
-and its interval is from the same bootstrap.
+95% intervals count trainings, as in results.py. A rank is among all lines of the table, and its interval is
+from draws of all means.
 """
 
 from __future__ import annotations
@@ -16,16 +16,21 @@ from pathlib import Path
 import numpy as np
 from pages import own_best, write
 from pandas import DataFrame, concat
-from results import GROUPS, TWENTY_FIVE, WARM
+from results import CHOICES, GROUPS, TWENTY_FIVE, WARM, all_lengths, paper_table
 from scipy.stats import rankdata
+from scipy.stats import t as student_t
 from shared import (
     DOCS,
     GAUSSIAN,
     OUT,
+    PAST,
+    PREVIEW,
     SOURCES,
     WIDTH,
+    Comparison,
     at_nine_three_one,
     beside,
+    compare,
     figure,
     finish,
     read_cells,
@@ -35,11 +40,13 @@ from shared import (
     with_own_noise,
 )
 
-from lab.statistics import resampled_means
+from lab.paper import PAPER_SUCCESS
+from lab.statistics import interval, spread_of
 
 PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
 DOOR = "door, 25"
 PUSHT = "pusht"
+DRAWS = 2_000  # of the means, for the intervals of ranks
 Sets = Mapping[str, tuple[str, Sequence[str]]]
 """By name of the demonstrations: the task, and the runs that have its rows."""
 
@@ -67,22 +74,30 @@ def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
     return with_own_noise(rows) if own_noise else rows
 
 
-def pairs(sets: Sets = HUMAN, baseline: str = GAUSSIAN, by: Sequence[str] = ("source", "nfe")) -> DataFrame:
-    """Return episodes won and lost against a source, over all sets, or by more columns.
+def beside_source(
+    source: str, nfe: int, baseline: str = GAUSSIAN, sets: Sets = HUMAN, own_noise: bool = True
+) -> Comparison:
+    """Return a source beside another over all sets, training by training.
 
-    That source has the same NFE, or, if it was not played with that, its largest.
+    The other has the same NFE, or, if it was not played with that, its largest. Without `own_noise` each has
+    its best noise per set, chosen on other episodes.
     """
-    rows = trials(sets)
-    others, base = rows[rows["source"] != baseline], rows[rows["source"] == baseline]
-    base_nfe = others["nfe"].where(others["nfe"].isin(base["nfe"]), base["nfe"].max())
-    keys = ["set", "seed"]
-    both = others.assign(base_nfe=base_nfe).merge(
-        base, left_on=[*keys, "base_nfe"], right_on=[*keys, "nfe"], suffixes=("", "_base")
-    )
-    for ahead, name in (1, "won"), (-1, "lost"):
-        differences = both["solved"] - both["solved_base"]
-        both[name] = [(ahead * difference > 0).sum() for difference in differences]
-    return both.groupby([*by])[["won", "lost"]].sum().astype(int)
+    rows = trials(sets, own_noise)
+    of_baseline = rows[rows["source"] == baseline]["nfe"]
+    base_nfe = nfe if nfe in set(of_baseline) else of_baseline.max()
+    cells = []
+    for _, part in rows.groupby("set"):
+        one, two = (
+            part[(part["source"] == name) & (part["nfe"] == n)]
+            for name, n in ((source, nfe), (baseline, base_nfe))
+        )
+        seeds = sorted({*one["seed"]} & {*two["seed"]})
+        if own_noise:
+            cells.append([np.stack([*each.set_index("seed").loc[seeds, "solved"]]) for each in (one, two)])
+        else:
+            best = own_best(part[(part["nfe"] == nfe) & part["source"].isin((source, baseline))])
+            cells.append([best[name].reshape(len(seeds), -1) for name in (source, baseline)])
+    return compare(*zip(*cells, strict=True))
 
 
 def with_best_noise(sets: Sets = HUMAN) -> dict[tuple[str, int], float]:
@@ -104,9 +119,11 @@ def standings(sets: Sets = HUMAN) -> DataFrame:
         by_set = {name: group for name, group in part.groupby("set")}
         if set(by_set) != set(sets) or part["seed"].nunique() == 1:
             continue
-        draws.append(
-            100 * resampled_means([(g["successes"], g["episodes"].iloc[0]) for g in by_set.values()], rng)
-        )
+        cells = [np.stack(list(group["solved"])) for group in by_set.values()]
+        spread = spread_of(cells, shared_starts=True)
+        low, high = (100 * end for end in interval(cells, spread, 0.95))
+        half_width = student_t.ppf(0.975, spread.freedom)
+        draws.append((low + high) / 2 + (high - low) / 2 / half_width * rng.standard_t(spread.freedom, DRAWS))
         rates = {name: 100 * g["successes"].sum() / g["episodes"].sum() for name, g in by_set.items()}
         mean, at_best = np.mean(list(rates.values())), best.get((source, nfe), np.nan)
         lines.append({"source": source, "nfe": nfe, "mean": mean, "best noise": at_best, **rates})
@@ -140,33 +157,31 @@ def draw() -> None:
 
 def table(sets: Sets) -> str:
     """Return the standings in Markdown."""
-    frame, won_and_lost = standings(sets), pairs(sets)
+    frame = standings(sets)
     names = [name for name in ("mean", "best noise", *sets) if frame[name].notna().any()]
-    text = [f"| rank | method | NFE | {' | '.join(names)} | won : lost |"]
+    text = [f"| rank | method | NFE | {' | '.join(names)} | ahead : behind |"]
     text.append("|---" * (4 + len(names)) + "|")
     for _, row in frame.iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f}-{row['rank_high']:.0f})"
-        setting = row["source"], row["nfe"]
-        pair = won_and_lost.loc[setting] if setting in won_and_lost.index else None
+        pair = "" if row["source"] == GAUSSIAN else str(beside_source(row["source"], row["nfe"], sets=sets))
         rates = ["" if np.isnan(row[name]) else f"{row[name] + 1e-6:.0f}" for name in names]
-        cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates]
-        cells.append("" if pair is None else f"{pair.won}:{pair.lost}")
+        cells = [place, SOURCES[row["source"]][0], str(row["nfe"]), *rates, pair]
         text.append(f"| {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
 
 def one_seed_table() -> str:
     """Return the mean success of a single training per set in Markdown, of the methods that have only one."""
-    rows, won_and_lost = trials().query("seed == 0"), pairs()
+    rows = trials().query("seed == 0")
     rates = rows.groupby(["source", "nfe", "set"])["success_rate"].mean().groupby(["source", "nfe"])
     means = 100 * rates.mean()[rates.size() == len(HUMAN)]
-    text = ["| method | NFE 9 | won : lost | NFE 1 | won : lost |", "|---" * 5 + "|"]
+    text = ["| method | NFE 9 | ahead : behind | NFE 1 | ahead : behind |", "|---" * 5 + "|"]
     for source in (GAUSSIAN, *sorted({source for source, _ in means.index} - {*standings()["source"]})):
         cells = []
         for setting in ((source, 9), (source, 1)):
-            played, compared = setting in means, setting in won_and_lost.index
+            played = setting in means
             cells.append(f"{means[setting] + 1e-6:.0f}" if played else "")
-            cells.append("{won}:{lost}".format(**won_and_lost.loc[setting]) if played and compared else "")
+            cells.append(str(beside_source(*setting)) if played and source != GAUSSIAN else "")
         text.append(f"| {SOURCES[source][0]} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
@@ -183,9 +198,26 @@ def readme_table() -> str:
     return "\n".join(text) + "\n"
 
 
+def effect_table() -> str:
+    """Return the mean gain of warm sources in Markdown: the paper's, and ours with intervals."""
+    text = ["| | NFE | the paper, 13 cells | human demonstrations | long training, seven sets |"]
+    text.append("|---" * 5 + "|")
+    for source in (PAST, PREVIEW):
+        longer = all_lengths(source, CHOICES["long training"])
+        for nfe, long in zip((9, 3, 1), longer, strict=True):
+            paper = np.mean([cell[source][nfe] - cell[GAUSSIAN][nfe] for cell in PAPER_SUCCESS.values()])
+            human = beside_source(source, nfe)
+            text.append(f"| {SOURCES[source][0]} | {nfe} | {paper:+.1f} | {human.points} | {long.points} |")
+    return "\n".join(text) + "\n"
+
+
 def tables() -> dict[Path, list[str]]:
-    """Return the table of each page."""
-    return {PAGE: [table(HUMAN), one_seed_table(), table(SCRIPTED)], README: [readme_table()]}
+    """Return the tables of each page."""
+    return {
+        PAGE: [table(HUMAN), one_seed_table(), table(SCRIPTED)],
+        README: [readme_table()],
+        DOCS / "paper.md": [effect_table(), paper_table()],
+    }
 
 
 if __name__ == "__main__":

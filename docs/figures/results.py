@@ -3,9 +3,8 @@
 PYTHONPATH=benchmarks python docs/figures/results.py    # or: make results; writes docs/_static/results and
                                                         # the tables of three pages
 
-Intervals are 95%: Wilson's score interval of a success rate, Newcombe's of a difference. Both treat the
-episodes of all seeds as independent; the true spread is larger over training seeds, and smaller for paired
-episodes.
+Intervals are 95%, and count trainings: Student's, from the spread between trainings and between the starts
+that they share. Differences pair what the same seed played.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from pages import write
-from pandas import DataFrame, Series, concat
+from pandas import DataFrame, concat
 from shared import (
     CORRELATED,
     DOCS,
@@ -26,7 +25,10 @@ from shared import (
     PREVIEW,
     SOURCES,
     WIDTH,
+    Comparison,
     at_nine_three_one,
+    compare,
+    estimate,
     figure,
     finish,
     lines,
@@ -34,7 +36,6 @@ from shared import (
     read_played,
     save,
     shown_sources,
-    wilson,
     with_own_noise,
 )
 
@@ -59,23 +60,17 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
 WARM = (PAST, PREVIEW, CORRELATED)
 
 
-def gain(row: Series, base: Series) -> tuple[float, float, float]:
-    """Return the difference to the Gaussian source in points, and the lengths of its error bar."""
-    a, b = row["success"], base["success"]
-    (low, high), (base_low, base_high) = wilson(a, row["total"]), wilson(b, base["total"])
-    return a - b, np.hypot(a - low, base_high - b), np.hypot(high - a, b - base_low)
-
-
 def gains() -> DataFrame:
     """Return success minus the Gaussian source's at one step, in cells and on average over a group."""
     rows_of_chart = []
     for group, runs in GROUPS.items():
         cells = read_cells(runs).query("nfe == 1")
         tasks = [(f"{task}, {group}", part) for task, part in cells.groupby("task", sort=False)]
-        mean = cells.groupby("source", as_index=False).agg({"success": "mean", "total": "sum"})
-        for name, part in (*tasks, (f"mean of {group}", mean)):
-            part = part.set_index("source")
-            rows_of_chart += [[name, source, *gain(part.loc[source], part.loc[GAUSSIAN])] for source in WARM]
+        for name, part in (*tasks, (f"mean of {group}", cells)):
+            solved = part.pivot(index="task", columns="source", values="solved")
+            for source in WARM:
+                mean, low, high = estimate(solved[source] - solved[GAUSSIAN])
+                rows_of_chart.append([name, source, mean, mean - low, high - mean])
     return DataFrame(rows_of_chart, columns=["setting", "source", "gain", "down", "up"])
 
 
@@ -121,9 +116,9 @@ def iterations() -> None:
     for axis, (name, runs) in zip(axes, LENGTHS.items(), strict=False):
         cells = read_cells(runs, common_seeds=True)
         cells = cells[cells["source"].isin((GAUSSIAN, *WARM))]
-        # The same episodes were played at every NFE.
+        # The same episodes were played at every NFE, so an episode counts once, with its mean outcome.
         means = cells.groupby(["source", "iterations"], as_index=False).agg(
-            {"success": "mean", "total": "max"}
+            solved=("solved", lambda solved: np.mean([*solved], 0))
         )
         means["iterations"] //= 1_000
         lines(axis, means, "iterations", sorted(means["iterations"].unique()))
@@ -159,42 +154,42 @@ def lengths_table() -> str:
 
 
 def outcomes_by_length(runs: tuple[str, str], source: str, nfe: int) -> dict[str, np.ndarray]:
-    """Return outcomes of a source and the Gaussian one, ``[lengths, episodes]``, of their common seeds."""
+    """Return outcomes of a source and the Gaussian one, ``[lengths, seeds, episodes]``, of common seeds."""
     rows = concat([with_own_noise(read_played(run)).assign(run=run) for run in runs])
     rows = rows[rows["source"].isin((source, GAUSSIAN)) & (rows["nfe"] == nfe)]
     solved = rows.pivot(index="seed", columns=["source", "run"], values="solved").dropna()
-    return {s: np.stack([np.concatenate(list(solved[s, run])) for run in runs]) for s in (source, GAUSSIAN)}
+    return {s: np.stack([np.stack(list(solved[s, run])) for run in runs]) for s in (source, GAUSSIAN)}
 
 
-def all_lengths(source: str, choose: Callable[[np.ndarray], np.ndarray]) -> tuple[str, str, str]:
-    """Return the mean success of a source over all sets, that of the Gaussian source, and their pairs.
+def better_length(outcomes: np.ndarray) -> np.ndarray:
+    """Return the outcomes ``[seeds, episodes]`` of the better length, chosen on other episodes."""
+    return chosen_elsewhere(outcomes.reshape(len(outcomes), -1)).reshape(outcomes.shape[1:])
 
-    `choose` takes the outcomes after each length, and returns those of one. The texts are for NFE 9, 3 and 1.
+
+def all_lengths(source: str, choose: Callable[[np.ndarray], np.ndarray]) -> list[Comparison]:
+    """Return a source beside the Gaussian source over all sets, at NFE 9, 3 and 1.
+
+    `choose` takes the outcomes after each length, and returns those of one.
     """
-    texts = []
+    comparisons = []
     for nfe in (9, 3, 1):
         played = [outcomes_by_length(runs, source, nfe) for runs in LENGTHS.values()]
-        pairs = [[choose(of[name]) for name in (source, GAUSSIAN)] for of in played]
-        means = 100 * np.mean([[outcomes.mean() for outcomes in pair] for pair in pairs], 0) + 1e-6
-        won, lost = (sum((ahead * (a - b) > 0).sum() for a, b in pairs) for ahead in (1, -1))
-        texts.append((*(f"{mean:.0f}" for mean in means), f"{won}:{lost}"))
-    success, base, counts = zip(*texts, strict=True)
-    return "/".join(success), "/".join(base), ", ".join(counts)
+        comparisons.append(compare(*([choose(of[name]) for of in played] for name in (source, GAUSSIAN))))
+    return comparisons
 
 
-CHOICES = {"long training": lambda outcomes: outcomes[-1], "better length": chosen_elsewhere}
+CHOICES = {"long training": lambda outcomes: outcomes[-1], "better length": better_length}
 """After which training a source is played; the better length is chosen per set and NFE, on other episodes."""
 
 
 def sets_table() -> str:
     """Return the mean success of warm sources over all sets in Markdown, beside the Gaussian source's."""
-    text = [
-        "| | " + " | ".join(f"{choice} | {SOURCES[GAUSSIAN][0]} | won : lost" for choice in CHOICES) + " |"
-    ]
-    text.append("|---" * (1 + 3 * len(CHOICES)) + "|")
+    text = [f"| | NFE | {' | '.join(f'{choice} | Gaussian | ahead : behind' for choice in CHOICES)} |"]
+    text.append("|---" * (2 + 3 * len(CHOICES)) + "|")
     for source in WARM:
-        entries = [entry for choose in CHOICES.values() for entry in all_lengths(source, choose)]
-        text.append(f"| {SOURCES[source][0]} | {' | '.join(entries)} |")
+        for nfe, *pair in zip((9, 3, 1), *(all_lengths(source, c) for c in CHOICES.values()), strict=True):
+            entries = [text for c in pair for text in (*(f"{r + 1e-6:.0f}" for r in c.rates), str(c))]
+            text.append(f"| {SOURCES[source][0]} | {nfe} | {' | '.join(entries)} |")
     return "\n".join(text) + "\n"
 
 
@@ -222,11 +217,13 @@ def paper_table() -> str:
 
 
 def tables() -> dict[Path, list[str]]:
-    """Return the tables of each page in their order; the lab notes have those of runs alone."""
+    """Return the tables of each page in their order; the lab notes have those of runs alone.
+
+    The first table of paper.md is the leaderboard's, which has the human sets.
+    """
     return {
         PAGE: [table(), sets_table()],
         DOCS / "notes" / "evidence.md": [lengths_table()],
-        DOCS / "paper.md": [paper_table()],
     }
 
 

@@ -5,11 +5,10 @@ The tests look for each in its page. A sentence that is not there has older numb
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
-from leaderboard import SCRIPTED, pairs, standings, trials
-from pages import own_best
+from leaderboard import SCRIPTED, beside_source, standings
 from pandas import DataFrame
 from results import (
     CHOICES,
@@ -54,29 +53,9 @@ def falls(demonstrations: str, nfe: int) -> dict[str, str]:
     return {s: " to ".join(str(whole(100 * solved.mean())) for solved in of) for s, of in outcomes.items()}
 
 
-def pair(runs: Iterable[str], source: str, *nfes: int, noise: float = 1.0) -> str:
-    """Return the episodes won and lost against the Gaussian source, over runs and NFE (9, 3 and 1)."""
-    won = lost = 0
-    for run in runs:
-        for nfe in nfes or (9, 3, 1):
-            both = [
-                played(run, name, nfe, noise).set_index(["task", "seed"])["solved"].sort_index()
-                for name in (source, GAUSSIAN)
-            ]
-            for outcomes, base in zip(*both, strict=True):
-                won, lost = won + (outcomes > base).sum(), lost + (outcomes < base).sum()
-    return f"{won} : {lost}"
-
-
-def in_words(pair_of_counts: str) -> str:
-    """Return ``a : b`` or ``a:b`` as ``a won, b lost``."""
-    won, lost = pair_of_counts.split(":")
-    return f"{won.strip()} won, {lost.strip()} lost"
-
-
-def spaced(rates: str) -> str:
-    """Return ``a/b/c`` as a sentence has it, ``a / b / c``."""
-    return rates.replace("/", " / ")
+def spaced(rates: Iterable[float]) -> str:
+    """Return three rates as a sentence has them, ``a / b / c``."""
+    return " / ".join(str(whole(rate)) for rate in rates)
 
 
 def mean(runs: Iterable[str], source: str, nfe: int) -> float:
@@ -90,27 +69,15 @@ def gain(runs: Iterable[str], source: str, nfe: int) -> float:
     return mean(runs, source, nfe) - mean(runs, GAUSSIAN, nfe)
 
 
-def at_best_noise(source: str, nfe: int) -> str:
-    """Return episodes won and lost against the Gaussian source on human data, with each one's best noise."""
-    rows, won, lost = trials(own_noise=False).query("nfe == @nfe"), 0, 0
-    for _, part in rows.groupby("set"):
-        solved = own_best(part)
-        won += (solved[source] > solved[GAUSSIAN]).sum()
-        lost += (solved[source] < solved[GAUSSIAN]).sum()
-    return f"{won} : {lost}"
-
-
-def against(counts: Mapping[str, int]) -> str:
-    """Return episodes won and lost as ``a : b``."""
-    return f"{counts['won']} : {counts['lost']}"
-
-
 def sentences() -> dict[str, list[str]]:
     """Return the sentences of each page."""
     board = standings().set_index(["source", "nfe"])
+    rates = {setting: whole(mean) for setting, mean in board["mean"].items()}
     few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
     long, better = (all_lengths(PAST, choose) for choose in CHOICES.values())
+    correlated_long = all_lengths(CORRELATED, CHOICES["long training"])
+    long_rates, better_rates = ([spaced(c.rates[k] for c in of) for k in (0, 1)] for of in (long, better))
     lengths = read_cells((SHORT[-1], LONG[-1]), common_seeds=True).query("nfe == 1")
     transport = [
         whole(lengths[(lengths["run"] == runs[-1]) & (lengths["source"] == s)]["success"].mean())
@@ -127,87 +94,74 @@ def sentences() -> dict[str, list[str]]:
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     at_80000 = {s: solved("pusht_206_80000", s, 9) for s in (GAUSSIAN, *WARM)}
     half = {s: solved("pusht_206_80000", s, 9, 0.5) for s in (GAUSSIAN, PAST)}
-    half_pair = pair(["pusht_206_80000"], PAST, 9, noise=0.5)
-    half_short = whole(solved("pusht_206_45000", GAUSSIAN, 9, 0.5))
-    mip = board.loc["mip", 2]
     joints = [solved("joint_targets_10000", s, 3) for s in (GAUSSIAN, *WARM)]
     fall = falls("door, 25 human", 3)
-    best_mean = {s: whole(board.loc[s, 9]["best noise"]) for s in (GAUSSIAN, PAST)}
-    (won, lost), mip_pair, mip_beside_past, past_once = (
-        frame.loc[setting]
-        for frame, setting in (
-            (pairs(), (PAST, 9)),
-            (pairs(), ("mip", 2)),
-            (pairs(baseline=PAST), ("mip", 2)),
-            (pairs(SCRIPTED), (PAST, 1)),
-        )
-    )
-    learned_at_best = {n: at_best_noise(CVAE, n) for n in (9, 3, 1)}
-    one_loss = {
-        s: {n: whole(board.loc[f"{s},l1", n]["mean"]) for n in (9, 1)} for s in (GAUSSIAN, CORRELATED)
-    }
-    squared = {n: whole(board.loc[GAUSSIAN, n]["mean"]) for n in (9, 1)}
-    gained = {n: against(pairs().loc[f"{GAUSSIAN},l1", n]) for n in (9, 1)}
-    beside_one_loss = pairs(baseline=f"{GAUSSIAN},l1").loc[f"{CORRELATED},l1", 9]
-    past_one_loss = whole(board.loc[f"{PAST},l1", 9]["mean"])
-    learned = {nfe: whole(board.loc[CVAE, nfe]["mean"]) for nfe in (9, 1)}
-    learned_pairs = pairs().loc[CVAE]
-    trainings = pairs(by=("source", "nfe", "set", "seed")).loc[CVAE, 9]
-    ahead, later = (trainings["won"] > trainings["lost"]).sum(), trainings.query("seed > 0").sum()
+    past, preview_once, mip = (beside_source(*s) for s in ((PAST, 9), (PREVIEW, 1), ("mip", 2)))
+    at_best = {n: beside_source(CVAE, n, own_noise=False) for n in (9, 3, 1)}
+    past_at_best = beside_source(PAST, 9, own_noise=False)
+    past_once = beside_source(PAST, 1, sets=SCRIPTED)
+    learned = {n: beside_source(CVAE, n) for n in (9, 1)}
+    learned_mip = {n: beside_source(CVAE, n, "mip") for n in (9, 1)}
+    absolute = {n: beside_source(f"{GAUSSIAN},l1", n) for n in (9, 1)}
+    mip_past = beside_source("mip", 2, PAST)
+    correlated_l1 = beside_source(f"{CORRELATED},l1", 9, f"{GAUSSIAN},l1")
     return {
         "../README.md": [
-            f"the Gaussian source solves {one_loss[GAUSSIAN][9]}%, WP-Past {past_one_loss} and WP-Past with "
-            f"correlated noise {one_loss[CORRELATED][9]}",
-            f"without a source, which solves {whole(mip['mean'])}%",
-            f"the decoder of a CVAE, solves most, {learned[9]}% ({in_words(against(learned_pairs.loc[9]))})",
-            f"solves {whole(board.loc[PAST, 9]['mean'])}% of the episodes and the Gaussian source "
-            f"{whole(board.loc[GAUSSIAN, 9]['mean'])} ({won} won, {lost} lost)",
-            f"({best_mean[PAST]} and {best_mean[GAUSSIAN]}%)",
-            f"WP-Past and WP-Preview succeed {span(few)} points more often at one step",
-            f"(WP-Past with 25: {in_words(pair(GROUPS[TWENTY_FIVE], PAST, 1))})",
-            f"{span(short)} points less often at one step after 10,000 iterations",
-            f"it solves {spaced(long[0])}% at nine, three",
-            f"the Gaussian source {spaced(long[1])} ({in_words(long[2].split(', ')[0])} at nine)",
-            f"{spaced(better[0])} and {spaced(better[1])}, within chance",
-            f"{whole(half[PAST])}% with half of the noise at nine steps, and {whole(half[GAUSSIAN])} "
-            f"({in_words(half_pair)}), or {half_short} after shorter training",
+            f"{rates[PAST, 9]}% and {rates[GAUSSIAN, 9]}% ({past.in_trainings}, {past.chance})",
+            f"{rates[PAST, 1]}% and {rates[GAUSSIAN, 1]}% at one, within chance",
+            f"{span(few)} points more at one evaluation",
+            f"({past_once.in_trainings}, {past_once.chance})",
+            f"{span(short)} points less at one evaluation",
+            f"{long_rates[0]}% and {long_rates[1]}% at nine, three and one",
+            f"each at its better length of training, {better_rates[0]} and {better_rates[1]}",
+            f"a learned source, the decoder of a CVAE, solves {rates[CVAE, 9]}% ({learned[9].chance})",
+            f"MIP, a regression in two steps, {rates['mip', 2]} ({mip.chance})",
+            f"the Gaussian source with an L1 loss {rates[f'{GAUSSIAN},l1', 9]} ({absolute[9].chance})",
         ],
         "which_source.md": [
             f"after 80,000, two seeds, {fifty_long[0]} and {fifty_long[1]} against {fifty_long[2]}",
             f"{span(joints)}% at three steps",
             f"WP-Past and WP-Preview succeed {span(short)} points less often",
             f"the Gaussian source falls from {fall[GAUSSIAN]}% at three steps, WP-Past from {fall[PAST]}",
-            f"WP-Past and WP-Preview succeed {span(few)} points more often",
+            f"WP-Past and WP-Preview succeed {span(few)} points more often at one step on average, within "
+            f"chance (WP-Past with 25: {past_once.chance})",
             f"the Gaussian source solves {whole(pusht[206][GAUSSIAN])}% at nine steps, "
             f"warm sources {span([pusht[206][s] for s in WARM])}%",
             f"{whole(at_80000[GAUSSIAN])}%, and {span([at_80000[s] for s in WARM])} (with half the "
             f"noise WP-Past has {whole(half[PAST])}, the Gaussian source {whole(half[GAUSSIAN])})",
-            f"lead with {fifty[0]} and {fifty[1]}%, against the Gaussian source's {fifty[2]}",
-            f"the decoder of a CVAE solves most ({learned[9]}% at nine steps",
+            f"solve {fifty[0]} and {fifty[1]}%, and the Gaussian source {fifty[2]}",
+            f"the decoder of a CVAE solves most ({rates[CVAE, 9]}% at nine steps",
             f"the Gaussian source then solves {transport[2]}% at one step in place of {transport[0]}, "
             f"and WP-Past {transport[3]} in place of {transport[1]}",
             f"at one step sources solve {span(loss)}% fewer episodes than at nine",
         ],
         "leaderboard.md": [
-            f"the decoder of a CVAE solves {learned[9]}% at nine steps, the Gaussian source {squared[9]} "
-            f"({one_loss[GAUSSIAN][9]} with an L1 loss), WP-Past {whole(board.loc[PAST, 9]['mean'])} "
-            f"and MIP {whole(mip['mean'])}",
-            f"at nine steps ({against(learned_pairs.loc[9])}, in {ahead} of {len(trainings)} trainings) "
-            f"and at one ({against(learned_pairs.loc[1])}), also with each one's best noise "
-            f"({learned_at_best[9]}, {learned_at_best[3]} and {learned_at_best[1]} at nine, three and one), "
-            f"and level with MIP ({against(pairs(baseline='mip').loc[CVAE, 9])})",
-            f"the first had led, and lead too ({against(later)})",
-            f"from {squared[1]} to {one_loss[GAUSSIAN][1]}% at one step "
-            f"({gained[1]}) and to {one_loss[GAUSSIAN][9]} at nine ({gained[9]})",
-            f"correlated noise solves {one_loss[CORRELATED][9]}% at nine ({against(beside_one_loss)})",
-            f"ahead of the Gaussian source at nine steps ({against(mip_pair)}), "
-            f"and of WP-Past within chance ({against(mip_beside_past)})",
-            f"ahead of the Gaussian source ({against(past_once)}, two-sided",
-            f"WP-Past solves {best_mean[PAST]}% and the Gaussian source {best_mean[GAUSSIAN]} "
-            f"({at_best_noise(PAST, 9)})",
+            f"the decoder of a CVAE solves {rates[CVAE, 9]}% at nine steps, the Gaussian source "
+            f"{rates[GAUSSIAN, 9]}, WP-Past {rates[PAST, 9]} and MIP {rates['mip', 2]}",
+            f"WP-Past solves {past.gain:.0f} points more at nine steps ({past.in_trainings}, {past.chance})",
+            f"WP-Preview at one step solves fewer ({preview_once.in_trainings}, {preview_once.chance})",
+            f"at nine steps ({learned[9].in_trainings}, {learned[9].chance}) "
+            f"and at one ({learned[1].chance})",
+            f"with each one's best noise at three and one ({at_best[3].chance} each), not at nine "
+            f"({at_best[9].chance})",
+            f"beside MIP within chance at nine ({learned_mip[9].chance}) "
+            f"and at one ({learned_mip[1].chance})",
+            f"from {rates[GAUSSIAN, 1]} to {rates[f'{GAUSSIAN},l1', 1]}% at one step "
+            f"({absolute[1].chance}) and from {rates[GAUSSIAN, 9]} to {rates[f'{GAUSSIAN},l1', 9]} at nine, "
+            f"within chance ({absolute[9].chance})",
+            f"correlated noise solves {rates[f'{CORRELATED},l1', 9]}% at nine ({correlated_l1.chance})",
+            f"ahead of the Gaussian source at nine steps ({mip.chance}), "
+            f"and of WP-Past within chance ({mip_past.chance})",
+            f"WP-Past is {past_once.gain:.0f} points ahead of the Gaussian source ({past_once.in_trainings}, "
+            f"{past_once.chance})",
+            f"WP-Past solves {whole(past_at_best.rates[0])}% and the Gaussian source "
+            f"{whole(past_at_best.rates[1])} ({past_at_best.chance})",
         ],
         "results.md": [
-            f"on transport at nine ({pair([LONG[-1]], PREVIEW, 9)})",
+            f"({' and '.join(dict.fromkeys(c.chance for c in long))}), and so is correlated noise at nine "
+            f"and three ({correlated_long[0].chance} each)",
+            f"With 25, WP-Past is {past_once.gain:.0f} points ahead ({past_once.in_trainings}, "
+            f"{past_once.chance})",
         ],
         "faq.md": [
             f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0), and 1 solved more: {whole(noise[1])}%, "

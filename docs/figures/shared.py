@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat, read_json
 
 from lab.methods import METHODS
+from lab.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, spread_of
 
 INK = "#767676"  # text and lines, which a white and a black page show equally well
 matplotlib.rcParams |= {"savefig.transparent": True, "grid.color": INK, "grid.alpha": 0.3}
@@ -63,8 +65,8 @@ def with_own_noise(rows: DataFrame) -> DataFrame:
 def read_cells(names: Iterable[str], common_seeds: bool = False) -> DataFrame:
     """Return success at the own noise of each source, a row per run, task, source and NFE.
 
-    Its columns ``success`` (percent) and ``total`` are over all seeds, or over those that all runs have;
-    ``seeds`` is their number.
+    Its column ``success`` (percent) is over all seeds, or over those that all runs have; ``seeds`` is their
+    number, and ``solved`` has their outcomes, ``[trainings, episodes]``.
     """
     runs = [with_own_noise(read_played(name)).assign(run=name) for name in names]
     rows = concat(runs)
@@ -72,9 +74,9 @@ def read_cells(names: Iterable[str], common_seeds: bool = False) -> DataFrame:
         rows = rows[rows["seed"].isin(set.intersection(*(set(run["seed"]) for run in runs)))]
     keys = ["run", "task", "data", "iterations", "source", "nfe"]
     cells = rows.groupby(keys, as_index=False, sort=False).agg(
-        successes=("successes", "sum"), total=("episodes", "sum"), seeds=("seed", "nunique")
+        solved=("solved", np.stack), seeds=("seed", "nunique")
     )
-    return cells.assign(success=100 * cells["successes"] / cells["total"])
+    return cells.assign(success=[100 * solved.mean() for solved in cells["solved"]])
 
 
 def at_nine_three_one(rows: DataFrame, source: str) -> str:
@@ -84,11 +86,71 @@ def at_nine_three_one(rows: DataFrame, source: str) -> str:
     return "/".join(f"{rates[nfe] + 1e-6:.0f}" for nfe in places)
 
 
-def wilson(success: float, total: float) -> np.ndarray:
-    """Return the lower and upper end of a success rate's interval in percent."""
-    p, z2 = success / 100, 1.96**2 / total
-    half = np.sqrt(p * (1 - p) * z2 + z2**2 / 4)
-    return 100 * (p + z2 / 2 + np.array([-half, half])) / (1 + z2)
+def estimate(cells: Iterable[np.ndarray]) -> tuple[float, float, float]:
+    """Return the mean over cells, each ``[trainings, episodes]``, and its interval's ends, in percent.
+
+    Trainings of a cell played the same starts, so the interval counts both.
+    """
+    cells = list(cells)
+    ends = interval(cells, spread_of(cells, shared_starts=True))
+    return tuple(100 * np.array([np.mean([cell.mean() for cell in cells]), *ends]))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A source beside another, training by training.
+
+    Attributes:
+        rates: the mean success of both in percent.
+        gain: their difference in points.
+        low: the lower end of its 95% interval.
+        high: the upper end.
+        ahead: the number of trainings in which the first solves more.
+        behind: the number in which it solves fewer.
+        trainings: the number of all.
+        p: the two-sided p-value by sign flips over trainings.
+    """
+
+    rates: tuple[float, float]
+    gain: float
+    low: float
+    high: float
+    ahead: int
+    behind: int
+    trainings: int
+    p: float
+
+    def __str__(self) -> str:
+        """Return the trainings ahead and behind, with the p-value if there are enough of them."""
+        chance = f", {self.chance}" if self.trainings >= ENOUGH_TRAININGS else ""
+        return f"{self.ahead} : {self.behind}{chance}"
+
+    @property
+    def chance(self) -> str:
+        """The p-value in words, with one significant digit, or two from 0.1 on."""
+        if self.p < 0.001:
+            return "p < 0.001"
+        return f"p = {self.p:.2f}" if self.p >= 0.095 else f"p = {self.p:.1g}"
+
+    @property
+    def in_trainings(self) -> str:
+        """The trainings ahead and behind in words."""
+        return f"ahead in {self.ahead} of {self.trainings} trainings and behind in {self.behind}"
+
+    @property
+    def points(self) -> str:
+        """The gain in points, with its interval."""
+        return f"{self.gain:+.1f} [{self.low:.1f}, {self.high:.1f}]"
+
+
+def compare(first: Iterable[np.ndarray], second: Iterable[np.ndarray]) -> Comparison:
+    """Return the comparison of two sources that played the same, in cells ``[trainings, episodes]``."""
+    first, second = list(first), list(second)
+    differences = [a - b for a, b in zip(first, second, strict=True)]
+    by_training = np.concatenate([cell.mean(1) for cell in differences])
+    rates = tuple(100 * float(np.mean([cell.mean() for cell in cells])) for cells in (first, second))
+    signs = int((by_training > 0).sum()), int((by_training < 0).sum())
+    return Comparison(rates, *estimate(differences), *signs, len(by_training), sign_flip_test(by_training))
 
 
 def figure(width: float, height: float, columns: int, title: str, rows: int = 1) -> tuple[Figure, list[Axes]]:
@@ -130,13 +192,11 @@ def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int]) -> None:
     """Draw the mean success over cells against a column, a line per source."""
     for k, source in enumerate(shown := shown_sources(rows)):
         label, color, mark = SOURCES[source]
-        part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
-        ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
-        bars = np.abs(ends - part["success"].to_numpy())
-        places = part.index.to_numpy(dtype=float) * beside(k, len(shown))
-        axis.errorbar(
-            places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
-        )
+        estimates = rows[rows["source"] == source].groupby(x)["solved"].agg(estimate)
+        means, *ends = np.array([*estimates]).T
+        places = estimates.index.to_numpy(dtype=float) * beside(k, len(shown))
+        bars = np.abs(np.array(ends) - means)
+        axis.errorbar(places, means, bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label)
     axis.set(xscale="log", ylim=(-3, 103))
     axis.set_xticks(ticks, [f"{n:,}" for n in ticks])
     axis.minorticks_off()
