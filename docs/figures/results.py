@@ -62,15 +62,18 @@ WARM = (PAST, PREVIEW, CORRELATED)
 
 def gains() -> DataFrame:
     """Return success minus the Gaussian source's at one step, in cells and on average over a group."""
-    rows_of_chart = []
+    differences: dict[tuple[str, str], list[np.ndarray]] = {}
     for group, runs in GROUPS.items():
         cells = read_cells(runs).query("nfe == 1")
         tasks = [(f"{task}, {group}", part) for task, part in cells.groupby("task", sort=False)]
         for name, part in (*tasks, (f"mean of {group}", cells)):
             solved = part.pivot(index="task", columns="source", values="solved")
-            for source in WARM:
-                mean, low, high = estimate(solved[source] - solved[GAUSSIAN])
-                rows_of_chart.append([name, source, mean, mean - low, high - mean])
+            differences |= {(name, source): list(solved[source] - solved[GAUSSIAN]) for source in WARM}
+    alike = [cells[0] for cells in differences.values() if len(cells) == 1]
+    rows_of_chart = []
+    for (name, source), cells in differences.items():
+        mean, low, high = estimate(cells, alike)
+        rows_of_chart.append([name, source, mean, mean - low, high - mean])
     return DataFrame(rows_of_chart, columns=["setting", "source", "gain", "down", "up"])
 
 

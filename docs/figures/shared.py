@@ -86,13 +86,14 @@ def at_nine_three_one(rows: DataFrame, source: str) -> str:
     return "/".join(f"{rates[nfe] + 1e-6:.0f}" for nfe in places)
 
 
-def estimate(cells: Iterable[np.ndarray]) -> tuple[float, float, float]:
+def estimate(cells: Iterable[np.ndarray], alike: Iterable[np.ndarray] = ()) -> tuple[float, float, float]:
     """Return the mean over cells, each ``[trainings, episodes]``, and its interval's ends, in percent.
 
-    Trainings of a cell played the same starts, so the interval counts both.
+    Trainings of a cell played the same starts, so the interval counts both. The cells that are `alike`, of a
+    chart for example, tell together how much trainings differ; by default these cells alone do.
     """
     cells = list(cells)
-    ends = interval(cells, spread_of(cells, shared_starts=True))
+    ends = interval(cells, spread_of(list(alike) or cells, shared_starts=True))
     return tuple(100 * np.array([np.mean([cell.mean() for cell in cells]), *ends]))
 
 
@@ -189,10 +190,11 @@ def beside(k: int, count: int) -> float:
 
 
 def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int]) -> None:
-    """Draw the mean success over cells against a column, a line per source."""
+    """Draw the mean success over cells against a column, a line per source, with intervals."""
     for k, source in enumerate(shown := shown_sources(rows)):
         label, color, mark = SOURCES[source]
-        estimates = rows[rows["source"] == source].groupby(x)["solved"].agg(estimate)
+        solved = rows[rows["source"] == source].groupby(x)["solved"]
+        estimates = solved.agg(lambda cells: estimate(cells, alike=rows["solved"]))
         means, *ends = np.array([*estimates]).T
         places = estimates.index.to_numpy(dtype=float) * beside(k, len(shown))
         bars = np.abs(np.array(ends) - means)
