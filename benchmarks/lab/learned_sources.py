@@ -17,7 +17,7 @@ from warmprior import keys
 from warmprior.checks import check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules.actor import StartPoint
 from warmprior.modules.prior import GaussianPrior, PastPrior, Source
-from warmprior.training.optim import warmup_cosine
+from warmprior.modules.schedule import warmup_cosine
 from warmprior.transforms.window import window_replay_buffer, without_images
 
 # Smallest calibrated standard deviation of a learned Gaussian source, in normalised action units.

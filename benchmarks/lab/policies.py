@@ -24,7 +24,6 @@ from filelock import FileLock
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 
-from lab.leader import leader_first
 from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, with_parts
@@ -34,7 +33,7 @@ from lab.stored_options import of_run, stored_options
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of, without_images
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
-from warmprior.io.distributed import from_leader, rank
+from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
