@@ -180,7 +180,7 @@ def test_train_needs_no_simulator(tmp_path, capsys, monkeypatch, task, env_name)
     monkeypatch.setitem(sys.modules, "mimicgen", None)
     path = tmp_path / "own.hdf5"
     write_robomimic_file(path, task=task, env_args=env_args_15(task) | {"env_name": env_name})
-    words = f"train {path} --out {tmp_path} --iterations 2 --hidden-dim 8"
+    words = f"train {path} --out {tmp_path} --iterations 2 --hidden-dim 8 --prior cvae,hidden_dim=8"
     assert main(words.split()) == 0
     said = capsys.readouterr().out
     assert "only trained" in said and load_policy(said.splitlines()[-1]).environment is not None

@@ -240,8 +240,8 @@ def train(
         network: options of the velocity network
         training: options of the recipe
         data: options of the demonstrations
-        prior: source (gaussian, past, preview, or package.module:Class of your own), with options as in
-            past,sigma=0.3
+        prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
+            in past,sigma=0.3
         chunk: chunk length H
         nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
         held_out: number of last demonstrations to leave out for measuring the error of actions; by default

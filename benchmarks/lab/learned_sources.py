@@ -1,36 +1,32 @@
-"""Sources of other papers that are trained on the demonstrations before the flow, and their training."""
+"""Sources of other papers that learn from the demonstrations before the flow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torch.optim import AdamW
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import ReplayBuffer
 from torchrl.modules import MLP
 
 from warmprior import keys
-from warmprior.checks import check_finite_numbers, check_positive, check_whole_numbers
+from warmprior.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.actor import StartPoint
-from warmprior.modules.prior import GaussianPrior, PastPrior, Source
-from warmprior.training.optim import warmup_cosine
-from warmprior.transforms.window import window_replay_buffer, without_images
+from warmprior.modules.learning import inside_mean, minimise, widths_of
+from warmprior.modules.prior import PastPrior, Source
 
 # Smallest calibrated standard deviation of a learned Gaussian source, in normalised action units.
 SCALE_FLOOR = 0.02
-CALIBRATION_WINDOWS = 4_096
 
 
 class Learner(nn.Module):
     r"""A network :math:`f_\phi(o, h)` of observation and last ``H`` actions with a loss of its own.
 
-    It is trained on the windows of the flow (:func:`learn`), and fixed afterwards. The last actions are read
-    once there are ``H`` of them. Subclasses are also sources or start points. Observations are single
-    tensors.
+    It is trained on the windows of the flow, and fixed afterwards. The last actions are read once there are
+    ``H`` of them. Subclasses are also sources or start points, whose :meth:`Prior.fit` it replaces.
+    Observations are single tensors.
     """
 
     sees_history: ClassVar[bool] = True
@@ -45,12 +41,26 @@ class Learner(nn.Module):
         check_whole_numbers(hidden_dim=hidden_dim)
         self.widths, self.hidden_dim = widths, hidden_dim
         if widths is not None:
-            self.action_dim, self.observation_dim, self.observation_steps = widths
+            self.action_dim, observation_dim, observation_steps = widths
             self.chunk_dim = self.chunk_length * self.action_dim
-            observed = self.sees_observation * self.observation_steps * self.observation_dim
+            observed = self.sees_observation * observation_steps * observation_dim
             self.input_dim = self.sees_history * (self.chunk_dim + 1) + observed
             self.build()
             self.requires_grad_(False)
+
+    def fit(
+        self,
+        windows: ReplayBuffer,
+        held_out: ReplayBuffer,
+        *,
+        iterations: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Train the networks, and calibrate them on held-out episodes."""
+        self._set_widths(widths_of(windows, self if self.sees_observation else None), self.hidden_dim)
+        minimise(self.learning_loss, self, windows, iterations=iterations, generator=generator)
+        with torch.no_grad():
+            self.calibrate(held_out.sample())
 
     def build(self) -> None:
         self.network = self.mlp(self.input_dim, self.heads * self.chunk_dim)
@@ -99,6 +109,8 @@ class LearnedPrior(PastPrior, Learner, abstract=True):
         nn.Module.__init__(self)
         PastPrior.__init__(self, chunk_length, sigma=sigma)
         self._set_widths(widths, hidden_dim)
+
+    fit = Learner.fit
 
     def _everywhere(self, loc: Tensor, scale: Tensor) -> Source:
         return Source(loc, scale, torch.ones_like(loc[..., :1], dtype=torch.bool))
@@ -178,82 +190,6 @@ class A2APrior(LearnedPrior):
         return self._everywhere(mean, torch.full_like(mean[..., :1], self.sigma))
 
 
-@dataclass(frozen=True)
-class Drawn(Source):
-    """A source with its own way of sampling."""
-
-    by: Any = None  # a function of a generator and the temperature
-
-    def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> Tensor:
-        return self.by(generator, temperature)
-
-
-class CVAEPrior(LearnedPrior):
-    r"""BRIDGER's learned source: the decoder of a conditional variational autoencoder.
-
-    .. math::
-        a_0 = g_\phi(o, z) + \sigma \varepsilon, \quad z \sim N(0, I), \qquad
-        \min_\phi E\left[\frac{1}{D} \|a_1 - g_\phi(o, z)\|^2
-        + \beta \frac{d_z}{D} \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
-
-    with :math:`D = P d_a` coordinates of a chunk and :math:`d_z` of ``z``; the first term is the mean over
-    the coordinates inside the episode (Chen et al., 2024). The flow is the same as for other priors, while
-    BRIDGER's path adds noise between the ends and is sampled as a stochastic differential equation. The
-    source is not Gaussian and has no mean, so agents search around zero. `latent_dim` is the width of ``z``.
-    """
-
-    name = "cvae"
-    default_sigma = 0.1
-    sees_history = False
-
-    def __init__(
-        self,
-        chunk_length: int,
-        *,
-        latent_dim: int = 8,
-        beta: float = 0.01,
-        widths: Sequence[int] | None = None,
-        hidden_dim: int = 256,
-        sigma: float | None = None,
-    ) -> None:
-        check_whole_numbers(latent_dim=latent_dim)
-        check_positive(beta=beta)
-        self.latent_dim, self.beta = latent_dim, beta
-        super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
-
-    def build(self) -> None:
-        self.encoder = self.mlp(self.input_dim + self.chunk_dim, 2 * self.latent_dim)
-        self.decoder = self.mlp(self.input_dim + self.latent_dim, self.chunk_dim)
-
-    def decode(self, inputs: Tensor, z: Tensor) -> Tensor:
-        return self.decoder(torch.cat([inputs, z], -1)).unflatten(-1, (-1, self.action_dim))
-
-    mean = GaussianPrior.mean  # cold everywhere
-
-    def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """Return a source that decodes a new latent for every sample; it is Gaussian given the latent."""
-        source, inputs = super().distribution(history, observation), self.network_input(history, observation)
-
-        def decoded(generator: torch.Generator | None, temperature: float) -> Tensor:
-            like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
-            z = torch.randn((*inputs.shape[:-1], self.latent_dim), generator=generator, **like)
-            loc = self.decode(inputs, z if temperature == 1.0 else temperature * z)
-            return replace(source, loc=loc, scale=loc.new_tensor(self.sigma)).sample(generator, temperature)
-
-        return Drawn(source.loc, source.scale, source.warm, by=decoded)
-
-    def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        inputs = self.network_input(windows[keys.HISTORY], windows[keys.OBSERVATION])
-        inside = ~windows[keys.IS_PAD].unsqueeze(-1)
-        encoded = self.encoder(torch.cat([inputs, (windows[keys.CHUNK] * inside).flatten(-2)], -1))
-        mean, log_variance = encoded.chunk(2, -1)
-        eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
-        z = mean + (0.5 * log_variance).exp() * eps
-        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
-        error = inside_mean(windows, (windows[keys.CHUNK] - self.decode(inputs, z)).square())
-        return error + self.beta * divergence / self.chunk_dim * self.latent_dim
-
-
 class ForecastStart(StartPoint, Learner):
     r"""STEP: a forecast enters the flow of a standard normal source at an intermediate time.
 
@@ -290,6 +226,8 @@ class ForecastStart(StartPoint, Learner):
         self.stall, self.stall_noise = stall, stall_noise
         self._set_widths(widths, hidden_dim)
 
+    fit = Learner.fit
+
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Return the forecast times the start time."""
         return self.time * self.predicted(history, observation)
@@ -302,64 +240,3 @@ class ForecastStart(StartPoint, Learner):
         full = (history["steps"] >= self.chunk_length).unsqueeze(-1)
         noise = torch.where(full & (moved < self.stall), (1 + self.stall_noise) * noise, noise)
         return (1 - self.time) * noise + self.time * forecast
-
-
-def inside_mean(windows: TensorDictBase, values: Tensor) -> Tensor:
-    """Return the mean over the coordinates of a chunk inside the episode; 0 if none is inside."""
-    counted = (~windows[keys.IS_PAD]).unsqueeze(-1).expand_as(values)
-    return (values * counted).sum() / counted.sum().clamp_min(1)
-
-
-def learn(
-    learner: Learner,
-    data: TensorDictBase,
-    *,
-    iterations: int,
-    learning_rate: float = 1e-3,
-    observation_steps: int = 2,
-    withhold: float = 0.0,
-    seed: int = 0,
-) -> None:
-    """Train the networks of a learner in place, and calibrate it on held-out episodes.
-
-    Every tenth episode is held out; with fewer than ten episodes, the second.
-    """
-    data = without_images(data)  # learners see no images
-    episodes = data[keys.EPISODE].flatten()
-    number = episodes.unique(return_inverse=True)[1]
-    is_held_out = number % 10 == 9 if int(number.max()) >= 9 else number == 1
-    device = data.device or torch.device("cpu")
-    generator = torch.Generator(device).manual_seed(seed)
-
-    def windows(part: TensorDictBase, size: int) -> TensorDictReplayBuffer:
-        return window_replay_buffer(
-            part,
-            GaussianPrior(learner.chunk_length),
-            batch_size=size,
-            observation_steps=observation_steps,
-            withhold=withhold,
-            generator=generator,
-        )
-
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        learner.build()
-        learner.to(device)
-    buffer = windows(data[~is_held_out], 256)
-    learner.requires_grad_(True).train()
-    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=1e-2, fused=True)
-    schedule = warmup_cosine(optimizer, iterations, 0.1)
-    for _ in range(iterations):
-        loss = learner.learning_loss(buffer.sample(), generator)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    learner.requires_grad_(False).eval()
-    if not all(bool(torch.isfinite(p).all()) for p in learner.parameters()):
-        raise FloatingPointError(
-            f"the networks of {type(learner).__name__} became NaN or infinite: lower the learning rate"
-        )
-    held_out = data[is_held_out] if bool(is_held_out.any()) else data
-    with torch.no_grad():
-        learner.calibrate(windows(held_out, CALIBRATION_WINDOWS).sample())

@@ -29,9 +29,9 @@ import torch
 
 from lab.bridge import BridgeCoupling
 from lab.couplings import OTCoupling, ReflowCoupling
-from lab.learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
+from lab.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
 from lab.mip import SECOND, MIPCoupling, TwoStepCoupling
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
+from warmprior import CVAEPrior, GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
 from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of, file_digest
 from warmprior.modules.option_text import find, options_of
@@ -91,6 +91,13 @@ class WarmStart(StartPoint):
         return self.centre(history, observation) + self.noise_share * noise
 
 
+class Point(Source):
+    """A source that is its mean, and draws nothing."""
+
+    def sample(self, generator: torch.Generator | None = None, temperature: float = 1.0) -> torch.Tensor:
+        return self.loc
+
+
 class PointPrior(GaussianPrior):
     """The source of a regression: the point 0, without randomness."""
 
@@ -102,8 +109,7 @@ class PointPrior(GaussianPrior):
 
     def distribution(self, history: Any, observation: Any = None) -> Source:
         source = super().distribution(history, observation)
-        none = torch.zeros_like(source.scale)
-        return Drawn(source.loc, none, source.warm, by=lambda generator, temperature: source.loc)
+        return Point(source.loc, torch.zeros_like(source.scale), source.warm)
 
 
 def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
@@ -329,7 +335,7 @@ class Method:
     def needs_vector(self) -> bool:
         """Return True if it reads the observation as one tensor, and so does not work with images."""
         parts = self.parts.prior, self.parts.start
-        reads = any(getattr(part, "sees_observation", False) for part in parts)
+        reads = CVAEPrior in parts or any(getattr(part, "sees_observation", False) for part in parts)
         return reads or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
 
     @cached_property
@@ -368,12 +374,12 @@ class Method:
         changes: dict[str, Any] = {} if self.is_flow else {"times": times}
         return replace(training, **changes | ({} if self.remembers else {"cold_probability": 0.0}))
 
-    def prior(self, widths: Sequence[int] = ()) -> Prior:
-        """Make a source; a learned one gets the widths d_a, d_o and To."""
-        return self._make(self.parts.prior, widths)
+    def prior(self) -> Prior:
+        return self.parts.prior(self.chunk_length, **self._own(self.parts.prior))
 
-    def start(self, widths: Sequence[int] = ()) -> Any:
-        return None if self.parts.start is None else self._make(self.parts.start, widths)
+    def start(self) -> Any:
+        make = self.parts.start
+        return None if make is None else make(self.chunk_length, **self._own(make))
 
     def coupling(self, teacher: WarmPriorActor | None = None) -> Coupling | None:
         """Make the coupling of source and targets; None if they pair in order."""
@@ -383,11 +389,6 @@ class Method:
     def _own(self, make: Any) -> dict[str, Any]:
         """Return the options that a part takes."""
         return {k: v for k, v in self.arguments.items() if k in _parameters(make)}
-
-    def _make(self, kind: Any, widths: Sequence[int]) -> Any:
-        learns = widths and issubclass(kind, Learner)
-        more = {"widths": list(widths)} if learns else {}
-        return kind(self.chunk_length, **self._own(kind), **more)
 
 
 def _parameters(part: Any) -> dict[str, Any]:

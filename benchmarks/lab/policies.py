@@ -24,8 +24,6 @@ from filelock import FileLock
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 
-from lab.leader import leader_first
-from lab.learned_sources import Learner, learn
 from lab.methods import Method
 from lab.options import Evaluation, Options, Run, with_parts
 from lab.rows import read_rows
@@ -34,7 +32,7 @@ from lab.stored_options import of_run, stored_options
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of, without_images
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
-from warmprior.io.distributed import from_leader, rank
+from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
@@ -47,9 +45,7 @@ from warmprior.training import (
     train_policy,
 )
 from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
-from warmprior.training.checkpoint import load_state, module_tensors, restore_module, restoring, save_state
-
-LEARNING_SHARE = 0.25  # gradient steps of a learned source per gradient step of the flow
+from warmprior.training.checkpoint import load_state
 
 
 @dataclass(frozen=True)
@@ -195,7 +191,7 @@ def slug(text: str) -> str:
 
 
 def train(policy: Policy) -> None:
-    """Train a policy that is not trained yet, and its teacher and learned source before.
+    """Train a policy that is not trained yet, and its teacher before.
 
     Other processes that train the same policy wait.
     """
@@ -210,28 +206,18 @@ def train(policy: Policy) -> None:
         # A worker sees only its own GPU.
         device = torch.device(policy.run.device).type
         training = method.recipe(policy.training)
-        widths = (
-            task.data["action"].shape[-1],
-            0 if task.images else task.vector.shape[-1],
-            policy.network.observation_steps,
-        )
-        prior, start = method.prior(widths), method.start(widths)
         progress = status_writer(policy.status, training.iterations)
-        for part in (prior, start):
-            if isinstance(part, Learner):
-                with leader_first():
-                    learned(part, policy, training)
         logger, logs = None, str(policy.run.folder / "logs")
         if policy.run.logger != "none" and not rank():
             logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
-        # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss`.
+        # Every step draws a_0 from the prior; the loss is `warmprior.FlowMatchingLoss`.
         train_policy(
             task,
-            prior,
+            method.prior(),
             policy.folder,
             network=policy.network,
             training=training,
-            start=start,
+            start=method.start(),
             coupling=method.coupling(teacher.load().to(device) if teacher else None),
             see_history=method.parts.sees_history,
             max_nfe=method.parts.played.get("nfe"),
@@ -274,24 +260,6 @@ def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
         write_atomic(path, lambda path: path.write_text(json.dumps(status)))
 
     return write
-
-
-def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
-    """Train a learned source, or load it if an earlier start of the training did."""
-    path = policy.folder / "learner.safetensors"
-    if path.exists():
-        with restoring(path):
-            restore_module(learner, load_state(path)[0])
-        return
-    learn(
-        learner,
-        policy.task().data,
-        iterations=max(1, round(LEARNING_SHARE * training.iterations)),
-        observation_steps=policy.network.observation_steps,
-        withhold=training.cold_probability,
-        seed=training.seed,
-    )
-    save_state(path, module_tensors(learner), policy.method.config())
 
 
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:

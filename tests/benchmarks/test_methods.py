@@ -121,7 +121,6 @@ def test_history_is_withheld_from_those_alone_that_remember():
     vector = {name for name in METHODS if Method(name, H).needs_vector}
     assert vector == {"forecast", "ot", "bridge", "step", "cvae", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector
-    assert Method("a2a", H).prior((2, 0, 1)).input_dim == 2 * H + 1  # with images, of which it needs none
 
 
 def test_the_noise_of_a_bridge_is_an_option_with_a_name_of_its_own():

@@ -31,9 +31,10 @@ from warmprior import (
 from warmprior.diagnostics import curvature, flow_paths
 from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
 from warmprior.envs.tasks import TASKS
+from warmprior.modules.schedule import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
 from warmprior.training import NetworkOptions, TrainingConfig
-from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.optim import ema_of, make_optimizer
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
 SCRIPTS = ("robomimic", "curvature", "sigma", "chunking", "budget", "real_time_chunking", "pusht")

@@ -168,7 +168,8 @@ def test_every_method_is_trained_with_what_it_needs_before_it(tmp_path, capsys):
     assert policies["reflow"].teacher().folder == policies["gaussian"].folder
     for name, policy in policies.items():
         actor, own_time = policy.load(), json.loads(policy.status.read_text())["seconds"]
-        assert (policy.folder / "learner.safetensors").exists() == (name in LEARNT)
+        kept = [part for part in ("prior", "start") if (policy.folder / f"{part}.safetensors").exists()]
+        assert kept == ([] if name not in LEARNT else ["start"] if name == "step" else ["prior"])
         assert actor.sampling.max_nfe == (1 if name == "regression" else None)
         assert all(bool(torch.isfinite(p).all()) for p in actor.parameters())
         # A training needs its teacher's.

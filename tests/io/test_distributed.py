@@ -3,11 +3,10 @@ import json
 import pytest
 import torch
 
-from lab.leader import leader_first
 from lab.machine import check_device
 from tests.errors import raises
 from tests.together import together
-from warmprior.io.distributed import launched, rank, world_size
+from warmprior.io.distributed import launched, leader_first, rank, world_size
 
 
 @pytest.fixture

@@ -6,12 +6,11 @@ from functools import partial
 import pytest
 import torch
 
-from lab.learned_sources import CVAEPrior
 from lab.source_errors import source_coverage
 from tests.diagnostics.fields import D_A, H, remember, targets
 from tests.errors import raises
 from tests.toy_env import mlp_actor
-from warmprior import PastPrior, PreviewPrior
+from warmprior import CVAEPrior, PastPrior, PreviewPrior
 
 N = 20_000
 actor = partial(mlp_actor, steps=1)

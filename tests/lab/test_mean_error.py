@@ -4,10 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lab.learned_sources import CVAEPrior, ForecastPrior
+from lab.learned_sources import ForecastPrior
 from lab.source_errors import mean_error, mean_revision
 from tests.diagnostics.fields import D_A, H, policy, remember, targets
-from warmprior import PastPrior, PreviewPrior
+from warmprior import CVAEPrior, PastPrior, PreviewPrior
 
 
 def still(t, a, observation):

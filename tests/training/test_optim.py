@@ -5,7 +5,8 @@ import torch
 from torch import nn
 
 from warmprior import VelocityMLP
-from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.modules.schedule import warmup_cosine
+from warmprior.training.optim import ema_of, make_optimizer
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from lab.learned_sources import ForecastPrior
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training
-from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior import CVAEPrior, ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.training import precondition
 
 READS = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "lift_fresh")
@@ -59,6 +59,7 @@ CASES = {
         preconditioned(PastPrior(4, correlation=0.5)),
     ),
     "learned": lambda: (CONFIG, dataset(), actor_for(ForecastPrior(4, widths=[2, 3, 2]), mlp())),
+    "decoded": lambda: (CONFIG, dataset(), actor_for(CVAEPrior(4, widths=[2, 3, 2]), mlp())),
     "images": lambda: (CONFIG, *with_images()),
 }
 

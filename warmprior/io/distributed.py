@@ -91,6 +91,30 @@ def from_leader[T](make: Callable[[], T]) -> T:
     return parcel[0][0]
 
 
+@contextmanager
+def leader_first() -> Iterator[None]:
+    """Run a block in the first process, and afterwards in the others, which find the work done.
+
+    A ``FloatingPointError`` or ``ValueError`` of the first process is raised in all, because it ends only a
+    training. After any other error, which the first process reports, the others raise ``SystemExit``.
+    """
+    failure: BaseException | None = SystemExit(2)
+    try:
+        if not rank():
+            yield
+            failure = None
+    except (FloatingPointError, ValueError) as error:
+        kind = FloatingPointError if isinstance(error, FloatingPointError) else ValueError
+        failure = kind(str(error))
+        raise
+    finally:
+        failure = from_leader(lambda: failure)
+    if rank():
+        if failure is not None:
+            raise failure
+        yield
+
+
 def check_batch(size: int) -> None:
     """Raise ValueError for a batch, of all processes together, that cannot be divided among them.
 

@@ -1,6 +1,7 @@
 """Priors, velocity networks and the actor."""
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
+from warmprior.modules.cvae import CVAEPrior
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.mlp import PlainMLP, VelocityMLP
@@ -15,6 +16,7 @@ from warmprior.modules.trend import PoseTrend, RestingAction, RestingJoints, Res
 
 __all__ = [
     "AdaLNTransformer",
+    "CVAEPrior",
     "ChiTransformer",
     "GaussianPrior",
     "ImageEncoder",

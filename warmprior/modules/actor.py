@@ -27,8 +27,8 @@ class StartPoint(Registered, nn.Module):
     """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
     The flow is trained from the prior's source as usual; at decisions integration starts from this point. A
-    start point is trained and frozen before the flow, and saved with the policy (``start`` of
-    :class:`~warmprior.WarmPriorActor`).
+    start point learns before the flow (:meth:`fit`) and is then frozen, and saved with the policy (``start``
+    of :class:`~warmprior.WarmPriorActor`).
 
     Attributes:
         time: ``s``.
@@ -48,6 +48,8 @@ class StartPoint(Registered, nn.Module):
 
     time: float
     noise_share: float
+
+    fit: Any = Prior.fit
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Return the point's mean, ``[*B, P, d_a]``, around which an agent searches."""

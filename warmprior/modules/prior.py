@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from warmprior.checks import check_between, check_not_negative, check_shape, check_whole_numbers, given
@@ -78,7 +79,8 @@ class Prior(Registered):
 
     The mean is a function of the history (:mod:`warmprior.history`), which has the same layout in training
     and deployment. Override :meth:`distribution` for another source, such as a learned one: a subclass that
-    is also an ``nn.Module`` (call ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
+    is also an ``nn.Module`` (call ``nn.Module.__init__`` first) is trained with the flow, and saved with the
+    policy. One that overrides :meth:`fit` learns before the flow, and is then frozen.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -149,6 +151,27 @@ class Prior(Registered):
         loc, warm = checked_mean(self, history)
         scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a plain number has no dtype
         return Source(torch.where(warm, loc, 0.0), scale, warm, self.correlation)
+
+    def fit(
+        self,
+        windows: ReplayBuffer,
+        held_out: ReplayBuffer,
+        *,
+        iterations: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Learn from training windows before the flow; by default do nothing.
+
+        :func:`~warmprior.training.train_policy` calls it once, freezes the result, and saves it with the
+        policy: constructor arguments, which this method may set, and if the prior is an ``nn.Module`` its
+        parameters and buffers. PyTorch's global generator, seeded, is for initial weights.
+
+        Args:
+            windows: the windows of the flow (:func:`~warmprior.window_replay_buffer`), without images.
+            held_out: windows of episodes that ``windows`` leaves out, such as every tenth.
+            iterations: the number of gradient steps to take.
+            generator: for all other draws, on the device of the windows.
+        """
 
 
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from warmprior import keys
 from warmprior.io.distributed import world_size
 from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.schedule import warmup_cosine
 from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
 from warmprior.training.checkpoint import (
     module_tensors,
@@ -24,7 +25,7 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
-from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.optim import ema_of, make_optimizer
 from warmprior.training.options import TrainingConfig
 
 

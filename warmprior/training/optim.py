@@ -1,19 +1,17 @@
-"""The optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 3)."""
+"""The optimiser and weight averaging of the paper's recipe (Table 3)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch.optim import AdamW, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from torch.optim import AdamW
 from torch.optim.swa_utils import AveragedModel
 
-from warmprior.checks import check_share, check_whole_numbers
+from warmprior.checks import check_share
 from warmprior.modules.network import uncompiled
 
 
@@ -23,37 +21,6 @@ def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_de
     Biases, norms and position embeddings do not decay.
     """
     return AdamW(uncompiled(network).parameter_groups(weight_decay), lr=learning_rate, fused=True)
-
-
-def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:
-    """Return a schedule with linear warm-up over the first iterations, then a cosine to zero.
-
-    Args:
-        optimizer: its learning rates are the peaks.
-        iterations: length of the whole training, at least 1.
-        warmup_ratio: share of the warm-up, in [0, 1); 0 starts at the peak.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.training import warmup_cosine
-        >>> optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
-        >>> schedule = warmup_cosine(optimizer, iterations=10, warmup_ratio=0.2)
-        >>> rates = []
-        >>> for _ in range(10):
-        ...     optimizer.step(); rates.append(round(schedule.get_last_lr()[0], 2)); schedule.step()
-        >>> rates
-        [0.5, 1.0, 1.0, 0.96, 0.85, 0.69, 0.5, 0.31, 0.15, 0.04]
-    """
-    check_whole_numbers(iterations=iterations)
-    check_share(warmup_ratio=warmup_ratio)
-    warmup = min(round(iterations * warmup_ratio), iterations - 1)
-
-    def factor(step: int) -> float:
-        if step < warmup:
-            return (step + 1) / warmup
-        return 0.5 * (1 + math.cos(math.pi * (step - warmup) / (iterations - warmup)))
-
-    return LambdaLR(optimizer, factor)
 
 
 def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:

@@ -313,7 +313,7 @@ def load_policy(
 
 def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorActor:
     """Return the actor of a configuration, with these weights, all of which must be finite."""
-    with _NoLargerThan(tensors):
+    with NoLargerThan(tensors):
         actor = _from_config(config)
     built = actor.state_dict()
     for name in sorted(built.keys() ^ tensors.keys()):
@@ -333,7 +333,7 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
     return actor
 
 
-class _NoLargerThan(TorchDispatchMode):
+class NoLargerThan(TorchDispatchMode):
     """A limit on the size of parts built from a file's options: not much more than the file's weights."""
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:

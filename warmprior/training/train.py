@@ -25,6 +25,7 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.training.learned_parts import learned, learns_first
 from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed
 from warmprior.training.saved import load_policy
@@ -102,7 +103,8 @@ def train_policy(
         demonstrations: a file or dataset that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
             ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
             them, in :meth:`Task.of`'s format; or a :class:`Task`.
-        prior: the source distribution.
+        prior: the source distribution. What it or ``start`` learns before the flow (:meth:`Prior.fit`), in a
+            quarter of the iterations, is saved with the policy; the given object stays as it is.
         directory: folder where the run is saved and resumed, see :class:`BehaviourCloning`; if omitted,
             nothing is saved and an interrupted run is lost.
 
@@ -152,6 +154,8 @@ def train_policy(
     network, training = network or NetworkOptions(), training or TrainingConfig()
     if not isinstance(prior, Prior):
         raise TypeError(f"the prior must be an object such as PastPrior(8), got {prior!r}")
+    if see_history and any(map(learns_first, (prior, start))):  # it would be given another observation
+        raise ValueError("a source or start point that learns before the flow needs see_history=False")
     check_device(device)  # before the demonstrations are read
     if isinstance(demonstrations, str | Path):
         task = Task.open(demonstrations, observation_keys=observation_keys, image_keys=image_keys)
@@ -180,6 +184,11 @@ def train_policy(
             stack.enter_context(closing(logger))  # type: ignore[type-var]
         if directory is None:
             directory = stack.enter_context(TemporaryDirectory())
+        given, steps = (task.data, training, directory), network.observation_steps
+        if learns_first(prior):
+            prior = learned(prior, prior, *given, observation_steps=steps)
+        if learns_first(start):
+            start = learned(start, prior, *given, observation_steps=steps)
         actor = new_policy(
             task,
             prior,
