@@ -308,6 +308,31 @@ def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) 
     return action_error(actor, batch, nfes=nfes)
 
 
+def export(
+    folder: Policy,
+    file: Path,
+    /,
+    *,
+    nfe: int | None = None,
+    revision: str | None = None,
+    modules: Imported = (),
+) -> None:
+    """Compile a saved policy's whole decision for this machine, for a control loop on a small computer.
+
+    Args:
+        folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
+            Hugging Face hub
+        file: file to write, such as policy.pt2, with a JSON file beside it
+        nfe: network evaluations per chunk; by default the policy's own
+        revision: branch, tag or commit of the repository; by default main
+        modules: module that defines your own prior or network; may be repeated
+    """
+    from warmprior.deploy import export_policy
+
+    path = export_policy(_policy(folder, revision, modules), file, nfe=nfe)
+    print(f"{path}: on this machine, AsyncExecutor(load_exported({str(path)!r})) runs it")
+
+
 def convert(
     file: Path,
     folder: Path,
@@ -348,7 +373,7 @@ def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> N
     print(observe_recordings(file, out, demos=demonstrations))
 
 
-COMMANDS = (info, push, evaluate, train, convert, observe)
+COMMANDS = (info, push, evaluate, train, export, convert, observe)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

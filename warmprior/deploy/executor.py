@@ -59,7 +59,8 @@ class AsyncExecutor:
     encoder takes the central crop.
 
     Args:
-        actor: a :class:`~warmprior.WarmPriorActor`, a :class:`~warmprior.lerobot.LeRobotActor`, or any module
+        actor: a :class:`~warmprior.WarmPriorActor`, an :class:`ExportedPolicy`, a
+            :class:`~warmprior.lerobot.LeRobotActor`, or any module
             that reads ``"observation"`` (or ``("prior", "observation")``, which includes the last actions),
             ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``. It is set to evaluation
             mode, and called without batch dimensions.
@@ -111,7 +112,7 @@ class AsyncExecutor:
         action_dim: int | None = None,
     ) -> None:
         plain = uncompiled(actor)
-        network = uncompiled(getattr(plain, "network", None))
+        network = uncompiled(getattr(plain, "network", plain))
         prior = getattr(plain, "prior", None) if prior is None else prior
         normalizer = getattr(plain, "normalizer", None) if normalizer is None else normalizer
         if action_dim is None:

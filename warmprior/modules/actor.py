@@ -258,9 +258,16 @@ class WarmPriorActor(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(
-        self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
+        self,
+        tensordict: TensorDictBase,
+        nfe: int | None = None,
+        generator: torch.Generator | None = None,
+        **unknown: Any,
     ) -> TensorDictBase:
         """Draw a source sample and integrate it to the chunk."""
+        # The signature takes any keyword, so that torch.export accepts entries as keyword arguments.
+        if unknown:
+            raise TypeError(f"unexpected arguments {sorted(unknown)}: the entries are {self.in_keys}")
         drawn = self.sampler(tensordict, generator=generator, temperature=self.sampling.temperature)
         return self.integrate(drawn, nfe=nfe)
 
