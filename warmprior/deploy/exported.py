@@ -158,6 +158,13 @@ def load_exported(path: str | Path) -> ExportedPolicy:
         FileNotFoundError: if the file or the JSON beside it is missing.
         ValueError: if the two do not belong together, or were written by another version of PyTorch or for
             another processor.
+
+    Examples:
+        >>> from warmprior.deploy import load_exported
+        >>> load_exported("nowhere/policy.pt2")
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: ...
     """
     path = Path(path)
     check_regular(path)
