@@ -6,6 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+pytest.importorskip("scipy")
+
+from scipy import stats
+
 from lab.statistics import bootstrap_ratio, chosen_elsewhere, paired_probability_better, probability_better
 from tests.errors import raises
 
@@ -41,7 +45,6 @@ def test_bootstrap_draws_whole_groups():
 
 @given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 60), st.integers(0, 60))
 def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, n_b):
-    np, stats = pytest.importorskip("numpy"), pytest.importorskip("scipy.stats")
     k_a, k_b = min(k_a, n_a), min(k_b, n_b)
     a, b = stats.beta(k_a + 1, n_a - k_a + 1), stats.beta(k_b + 1, n_b - k_b + 1)
     nodes, weights = np.polynomial.legendre.leggauss(200)
@@ -52,7 +55,6 @@ def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, 
 
 @pytest.mark.parametrize(("wins", "losses"), [(0, 0), (7, 2), (0, 5), (40, 41), (900, 100)])
 def test_paired_probability_is_that_of_a_beta(wins, losses):
-    stats = pytest.importorskip("scipy.stats")
     found = paired_probability_better(wins, losses)
     assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
     assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
