@@ -2,8 +2,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("h5py")
-
 from tests.data.synthetic import write_robomimic_file
 
 

@@ -3,6 +3,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("h5py")
+
 import h5py
 import numpy as np
 

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.spatial.transform import Rotation
 
 from tests.data.synthetic import env_args_14, env_args_15
 from tests.errors import raises
@@ -19,6 +18,8 @@ from warmprior.rotation import (
     rotation_6d_to_matrix,
     rotvec_to_matrix,
 )
+
+Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
 TASKS = ("lift", "can", "square", "transport")
 finite = st.floats(-4, 4, allow_nan=False, width=64)

@@ -7,11 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+
+pytest.importorskip("robosuite")
+pytest.importorskip("pyarrow")
+
+import h5py
+import numpy as np
+import pyarrow.parquet as parquet
 
 from lab.options import Options, with_parts
 from lab.presets import PRESETS
@@ -36,8 +41,6 @@ from warmprior.envs import modernize_env_args
 from warmprior.history import cold_history
 from warmprior.training.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.training.saved import load_policy, policy_config, save_policy
-
-parquet = pytest.importorskip("pyarrow.parquet")
 
 Case = tuple[str, Callable[[], Outcome], str]
 """How a file was damaged, the load to attempt, and what its error has to name."""

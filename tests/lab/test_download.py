@@ -2,12 +2,12 @@ from collections import Counter
 
 import pytest
 
+pytest.importorskip("huggingface_hub")
+
 from lab.downloads import REPOSITORIES, download_robomimic
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.io.hub_server import Loopback, etag, reachable
-
-pytest.importorskip("huggingface_hub")
 
 FIRST = REPOSITORIES[0]
 FILE = "v1.5/square/ph/low_dim_v15.hdf5"

@@ -4,6 +4,9 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+
+pytest.importorskip("scipy")
+
 from scipy import stats
 from scipy.special import expit, logit
 

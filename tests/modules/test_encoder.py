@@ -26,6 +26,8 @@ SIZE, CROP, STATE = 12, 8, 3
 
 def encoder_of(**options):
     given = {"image_size": SIZE, "crop_size": CROP, "backbone": "small"} | options
+    if given["backbone"] == "resnet18":
+        pytest.importorskip("torchvision")
     return ImageEncoder(CAMERAS, STATE, **given)
 
 
@@ -191,11 +193,10 @@ def test_a_saved_policy_returns_the_same_chunks(tmp_path, options):
 
 
 def test_imagenets_weights_go_to_the_convolutions_of_every_camera(monkeypatch):
-    from torchvision.models import ResNet18_Weights, resnet18
-
+    models = pytest.importorskip("torchvision.models")
     torch.manual_seed(1)
-    official = resnet18().state_dict()
-    monkeypatch.setattr(ResNet18_Weights, "get_state_dict", lambda self, **options: official)
+    official = models.resnet18().state_dict()
+    monkeypatch.setattr(models.ResNet18_Weights, "get_state_dict", lambda self, **options: official)
     encoder = encoder_of(backbone="resnet18")
     load_imagenet(encoder)
     for network in encoder.networks:

@@ -1,20 +1,20 @@
 from typing import ClassVar
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
+
+pytest.importorskip("robosuite")
+
+import gymnasium
+import numpy as np
 
 from tests.envs.test_gymnasium import Dial
 from tests.errors import raises
 from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
-from warmprior.training import play_episode, record_filmstrip
-
-pytest.importorskip("robosuite")
-
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_description, environment_of, registered_description
 from warmprior.envs.simulator import task_env_args
+from warmprior.training import play_episode, record_filmstrip
 
 
 def test_frames_are_of_the_evaluated_episode(monkeypatch):

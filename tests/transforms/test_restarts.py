@@ -1,9 +1,12 @@
 """Simulators that restart rows inside a step: every decision ends where its episode does."""
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
+
+pytest.importorskip("gymnasium")
+
+import gymnasium
+import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict
 from torchrl.collectors import Collector
