@@ -16,9 +16,9 @@ import torch
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)
 
-from tests.processes import here  # noqa: E402
-from warmprior.envs.tasks import TaskSpec  # noqa: E402
-from warmprior.io.workers import start_method  # noqa: E402
+from tests.processes import here
+from warmprior.envs.tasks import TaskSpec
+from warmprior.io.workers import start_method
 
 # Timings on a shared machine say nothing: no test fails for being slow once.
 hypothesis.settings.register_profile("shared-machine", deadline=None)
