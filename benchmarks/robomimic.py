@@ -17,7 +17,8 @@ from typing import Any
 from lab.command_line import parse, script, started
 from lab.comparison import compare
 from lab.options import Options
-from lab.pictures import draw
+from lab.phases import Phases
+from lab.pictures import draw, films
 from lab.policies import policies_of
 from lab.presets import PRESETS
 from lab.report import success_report, summary, terminal_table, unlike, write_report
@@ -27,21 +28,25 @@ def run(
     argv: list[str] | None, presets: Mapping[str, Options], study: str, doc: str | None, **parsing: Any
 ) -> None:
     """Run the whole benchmark: options, data, training and playing, table and pictures."""
+    phases = Phases()
     options = parse(presets, argv, study, doc, **parsing)
+    phases.end("imports and options")
     with started(options, study) as out:
         # Demonstrations are generated, downloaded, or read from --dataset. There is a policy per task, method
         # and seed. Policies of a task differ in the source alone (lab/methods.py); `train` in lab/policies.py
         # gives it to the loss.
         policies = policies_of(options)
+        phases.end("demonstrations")
 
         # A row per policy, checkpoint and NFE: the policy, how it was played, and the result.
-        rows, failures = compare(options, policies)
+        rows, failures = compare(options, policies, films=films(options, policies))
+        phases.end("training and playing")
 
         # The table, then the pictures.
         top_k = options.evaluation.top_k
         results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
-        notes = unlike(options, presets["paper"])
+        notes = [*unlike(options, presets["paper"]), f"Time before the pictures: {phases}."]
         full = success_report(results, top_k, notes, source)
         try:
             write_report(out, terminal_table(results, top_k), full, results, failures)

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from lab.files import PartialFailure
-from lab.jobs import Jobs
+from lab.jobs import Job, Jobs
 from lab.leader import go_on_alone
 from lab.measures import measure
 from lab.methods import Method
@@ -30,11 +30,13 @@ def compare(
     options: Options,
     policies: Sequence[Policy],
     conditions: Callable[[Method], Sequence[Cell]] = lambda method: [Cell(0, 0)],
+    films: Mapping[str, Callable[[], str | None]] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Train, measure and play what is missing; return the rows of the run, and its failures.
 
     Rows depend neither on the process that computes them nor on their order. `conditions` returns, for a
-    method, delays and guidances to play it with; each gives a row.
+    method, delays and guidances to play it with; each gives a row. `films` are further calls by the name of
+    the policy that they need; what they return is printed.
 
     Raises:
         ValueError: if the folder has rows of another run.
@@ -83,11 +85,18 @@ def compare(
             )
     failures = begin(options, policies)
     with Jobs(options.run) as jobs:
+
+        def explain(why_not: str | None) -> None:
+            if why_not is not None:
+                jobs.say(why_not)
+
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
             facts = played[policy.name]
             missing = [c for c in cells[policy.name] if not any(facts[c] <= row.items() for row in rows)]
             if str(policy) not in failures:
-                submit(jobs, policy, missing, evaluation, add)
+                trained = submit(jobs, policy, missing, evaluation, add)
+                if (film := (films or {}).get(policy.name)) is not None:
+                    jobs.submit(f"film {policy}", film, after=trained, then=explain)
         failures |= jobs.wait()
     reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
     if not rows:
@@ -133,8 +142,11 @@ def submit(
     cells: Sequence[Cell],
     evaluation: Evaluation,
     add: Callable[[dict[str, Any]], None],
-) -> None:
-    """Submit the jobs that train, measure and play a policy; `add` gets the row of each complete cell."""
+) -> Job:
+    """Submit the jobs that train, measure and play a policy; `add` gets the row of each complete cell.
+
+    The first job, which is returned, trains it.
+    """
     last, was_trained = policy.training.iterations, policy.is_trained
     episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
     # Of the last checkpoint, by temperature and NFE; earlier ones are only played.
@@ -168,3 +180,4 @@ def submit(
     for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
         job_options, job_seeds = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
         jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, job_seeds, **job_options)
+    return first

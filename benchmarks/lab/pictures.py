@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -18,16 +19,23 @@ from warmprior.envs.rendering import rendering_backend
 from warmprior.training import record_filmstrip
 
 
+def tasks_of(policies: Sequence[Policy]) -> dict[tuple[str, str], list[Policy]]:
+    """Return the policies by name and style of their task, in their order."""
+    tasks: dict[tuple[str, str], list[Policy]] = {}
+    for policy in policies:
+        tasks.setdefault((policy.facts["task"], policy.facts["data"]), []).append(policy)
+    return tasks
+
+
 def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> None:
-    """Draw posteriors of the success rates, learning curves, and an episode of every method, per task."""
-    tasks = list(dict.fromkeys((p.facts["task"], p.facts["data"]) for p in policies))
-    out = options.run.folder
-    for task, style in tasks:
+    """Draw posteriors of the success rates, and learning curves, per task."""
+    tasks, out = tasks_of(policies), options.run.folder
+    for (task, style), of_task in tasks.items():
         suffix = f"_{task}_{style}" if len(tasks) > 1 else ""
         task_rows = labelled(rows[(rows.task == task) & (rows.data == style)])
         if task_rows.empty:
             continue
-        played = [p for p in policies if p.name in set(task_rows.policy)]
+        played = [p for p in of_task if p.name in set(task_rows.policy)]
         chunks = ", ".join(map(str, sorted(set(task_rows.chunk))))
         title = f"{title_of(played[0].task())}, H = {chunks}"
         seeds = per_seed(task_rows, options.evaluation.top_k)
@@ -47,20 +55,34 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
                 print(f"No learning curve of {policy}: {policy.state} is missing")
         if losses:
             plot_learning_curves(losses, fewest, out / f"learning_curves{suffix}.png", title=title)
-        task = played[0].task()
-        if not options.run.videos:
-            continue
-        if "robosuite" in (task.environment or {}) and rendering_backend() is None:
+
+
+def films(options: Options, policies: Sequence[Policy]) -> dict[str, Callable[[], str | None]]:
+    """Return, by the names of the policies to film, the calls that do it: per task and method the first."""
+    calls: dict[str, Callable[[], str | None]] = {}
+    tasks = tasks_of(policies) if options.run.videos else {}
+    for (task, style), of_task in tasks.items():
+        first = of_task[0].task()
+        if "robosuite" in (first.environment or {}) and rendering_backend() is None:
             print(
                 "No filmstrips: neither EGL nor OSMesa works here. Install one (on Debian or Ubuntu apt-get "
                 "install libegl1 libegl-mesa0, or libosmesa6)."
             )
-        elif task.environment is not None or task.video_rate is not None:
-            for method, policy in {label[p.name]: p for p in reversed(played)}.items():
-                try:
-                    video(options, policy, method, suffix)
-                except Exception as error:  # a user's environment may fail in any way
-                    print(f"No filmstrip of {method}: {error}")
+        elif first.environment is not None or first.video_rate is not None:
+            methods = labelled(pd.DataFrame([policy.facts for policy in of_task]))["method"]
+            suffix = f"_{task}_{style}" if len(tasks) > 1 else ""
+            for method, policy in dict(reversed([*zip(methods, of_task, strict=True)])).items():
+                calls[policy.name] = partial(film, options, policy, method, suffix)
+    return calls
+
+
+def film(options: Options, policy: Policy, method: str, suffix: str) -> str | None:
+    """Record a film; return why there is none."""
+    try:
+        video(options, policy, method, suffix)
+    except Exception as error:  # a user's environment may fail in any way
+        return f"No filmstrip of {method}: {error}"
+    return None
 
 
 def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
