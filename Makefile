@@ -12,7 +12,7 @@ GROOT_NEEDS := tests/lerobot/groot_n15.txt
 CHECK_PYTHON := $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
 	{ echo "warmprior needs Python 3.12 or newer: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
 
-.PHONY: install benchmark throughput gpu test test-slow test-core test-groot-n15 latest lint fuzz results docs dist clean
+.PHONY: install benchmark throughput gpu test test-slow test-ulp test-core test-groot-n15 latest lint fuzz results docs dist clean
 
 install: .venv/installed
 
@@ -50,6 +50,10 @@ test: install
 # Slow tests: the built documentation, the wheel in an empty environment, long trainings.
 test-slow: install
 	$(PYTEST) -m slow $(ARGS)
+
+# The suite on a processor whose products depend on the number of rows in their last bits.
+test-ulp: install
+	PYTHONPATH=$(CURDIR)/tests/rows $(PYTEST) -m "not slow" $(ARGS)
 
 # Tests of the core without the simulator, on any system.
 CORE := .venv-core

@@ -1,5 +1,6 @@
 import gc
 import os
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -12,19 +13,31 @@ import torch
 # The tests' tensors are small: a second thread gains nothing, and on a busy machine costs much. TorchRL goes
 # back to the number that it was imported with when an environment closes, and with more than one a process
 # forked after that would wait for threads that it lacks: so before it is imported.
-torch.set_num_threads(1)
+if "OMP_NUM_THREADS" not in os.environ:
+    torch.set_num_threads(1)
 
-from tests.processes import here  # noqa: E402
-from warmprior.envs.tasks import TaskSpec  # noqa: E402
-from warmprior.io.workers import start_method  # noqa: E402
+from tests.processes import here
+from warmprior.envs.tasks import TaskSpec
+from warmprior.io.workers import start_method
 
 # Timings on a shared machine say nothing: no test fails for being slow once.
 hypothesis.settings.register_profile("shared-machine", deadline=None)
 hypothesis.settings.load_profile("shared-machine")
 
+collect_ignore = ["rows"]  # part of other runs, see there
 
-def pytest_collection_modifyitems(items):
+
+def pytest_addoption(parser):
+    parser.addoption("--shuffle", type=int, help="a seed: run the files, and the tests of each, in its order")
+
+
+def pytest_collection_modifyitems(config, items):
     """Without a GPU the tests that need one are skipped, each by its name."""
+    if (seed := config.getoption("shuffle")) is not None:
+        draw = random.Random(seed)
+        draw.shuffle(items)
+        places = {item.path: draw.random() for item in items}
+        items.sort(key=lambda item: places[item.path])
     for item in items:
         if item.get_closest_marker("cuda") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="needs a GPU"))
