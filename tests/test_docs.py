@@ -137,8 +137,9 @@ def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
     monkeypatch.syspath_prepend(DOCS / "figures")
     names = ("results", "leaderboard", "pages", "shared")
     results, leaderboard, pages, shared = map(importlib.import_module, names)
-    texts = {page: page.read_text() for page in (*results.tables(), *leaderboard.tables())}
-    for page, table in (results.tables() | leaderboard.tables()).items():
+    tables = results.tables() | leaderboard.tables()
+    texts = {page: page.read_text() for page in tables}
+    for page, table in tables.items():
         assert pages.with_tables(texts[page], table) == texts[page]
     text = "".join(texts.values())
     played = {name for _, name, _ in pages.PLAYED.findall(text)}

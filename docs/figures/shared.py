@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import matplotlib
@@ -44,10 +45,11 @@ SOURCES |= {name: (each.label, each.color, "o") for name, each in METHODS.items(
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 
 
+@cache
 def read_played(name: str) -> DataFrame:
     """Return the rows of a run, with source, factor of its noise, and the outcome of every episode.
 
-    The source of runs with an L1 loss, whose names end in ``_l1``, says so.
+    The source of runs with an L1 loss, whose names end in ``_l1``, says so. All callers share the table.
     """
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     options = rows["options"].where(rows["options"] == "", "," + rows["options"])
