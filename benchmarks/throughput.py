@@ -121,12 +121,44 @@ def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor
     return sample
 
 
-def windows_over_torch(clock: Clock) -> dict[str, float]:
+def bare_ranges(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor]]:
+    """Return a function that samples windows in bare torch, each as a range of padded episodes."""
+    observation, action, episode = (data[key] for key in ("observation", "action", "episode"))
+    episodes, length = int(episode[-1]) + 1, int((episode == 0).sum())
+    actions = action.view(episodes, length, -1)
+    before, behind = torch.zeros_like(actions[:, :H]), actions[:, -1:].expand(-1, H - 1, -1)
+    actions = torch.cat([before, actions, behind], 1).flatten(0, 1)
+    seen = observation.view(episodes, length, -1)
+    seen = torch.cat([seen[:, :1].expand(-1, TO - 1, -1), seen], 1).flatten(0, 1)
+    is_pad = torch.zeros(episodes, length + 2 * H - 1, dtype=torch.bool)
+    is_pad[:, H + length :] = True
+    frame = torch.arange(len(data))
+    steps_before = (frame % length).clamp_max(H).unsqueeze(-1)
+    rows, seen_rows = frame + episode * (2 * H - 1), frame + episode * (TO - 1)
+    ranges = actions.unfold(0, 2 * H, 1).mT, seen.unfold(0, TO, 1).mT, is_pad.flatten()[H:].unfold(0, H, 1)
+
+    def sample() -> list[torch.Tensor]:
+        frame = torch.randint(len(data), (batch,))
+        row = rows.index_select(0, frame)
+        moved = ranges[0].index_select(0, row)
+        history, target = moved[:, :H], moved[:, H:]
+        observations = ranges[1].index_select(0, seen_rows.index_select(0, frame))
+        known = steps_before.index_select(0, frame)
+        forecast, forecast_steps = torch.zeros_like(target), torch.zeros_like(known)
+        padding = ranges[2].index_select(0, row)
+        return [observations, target, padding, history, known, forecast, forecast_steps]
+
+    return sample
+
+
+def windows_over_torch(
+    clock: Clock, bare: Callable[[TensorDict, int], Callable[[], object]] = bare_windows
+) -> dict[str, float]:
     """Measure windows per second of the replay buffer over bare torch, by batch size."""
     data, ratio_by_batch = steps(400, 200), {}
     for batch in (BATCH, 1024):
         buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        ratio_by_batch[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
+        ratio_by_batch[str(batch)] = clock.ratio(bare(data, batch), buffer.sample, calls=100)
     return ratio_by_batch
 
 
@@ -383,6 +415,7 @@ def chunk_step_overhead(clock: Clock) -> float:
 
 FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
+    "windows_over_ranges": (partial(windows_over_torch, bare=bare_ranges), ">= 0.45"),
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
     "cuda_train_step_over_network": (partial(train_step_over_network, device="cuda", calls=20), "<= 1.05"),

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.errors import raises
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
-from warmprior.history import ENTRIES, advance, check_history, cold_history, without
+from warmprior.history import ENTRIES, advance, check_history, cold_history, window_history, without
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 
@@ -167,3 +167,10 @@ def test_a_mean_of_another_shape_or_type():
                 wrong.distribution(random_history(PastPrior(3), 4))
     finally:
         del Prior.classes["wrong-for-this-test"]
+
+
+def test_the_parts_of_a_window_that_do_not_fit_are_refused():
+    before, steps, target = torch.zeros(3, 2, 1), torch.zeros(3, 1, dtype=torch.int64), torch.zeros(3, 4, 1)
+    for wrong in ((before[1:], steps, target), (before, steps[:, 0], target), (before, steps, target[:2])):
+        with raises(ValueError, *(str(tuple(value.shape)) for value in wrong)):
+            window_history(*wrong, chunk_length=2)

@@ -154,10 +154,15 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
         >>> window_history(torch.zeros(2, 1), torch.tensor([0]), target, 2)["forecast"].flatten().tolist()
         [1.0, 2.0, 0.0, 0.0]
     """
-    ahead = target.shape[-2] - chunk_length
-    forecast = torch.cat([target[..., :ahead, :], torch.zeros_like(target[..., ahead:, :])], -2)
-    steps = steps.clamp(max=before.shape[-2])
-    return _history(target.shape[:-2], before, steps, forecast, torch.full_like(steps, ahead))
+    batch_size, ahead = target.shape[:-2], target.shape[-2] - chunk_length
+    if not batch_size == before.shape[:-2] == steps.shape[:-1]:
+        shapes = f"{tuple(before.shape)}, {tuple(steps.shape)} and {tuple(target.shape)}"
+        raise ValueError(f"need shapes [*B, H, d_a], [*B, 1] and [*B, P, d_a], got {shapes}")
+    forecast = torch.zeros_like(target)
+    if ahead:
+        forecast[..., :ahead, :] = target[..., :ahead, :]
+    steps = steps.clamp_max(before.shape[-2])
+    return _history(batch_size, before, steps, forecast, torch.full_like(steps, ahead))
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
@@ -179,7 +184,8 @@ def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
 
 
 def _history(batch_size: Any, *values: Tensor) -> TensorDict:
-    return TensorDict(dict(zip(ENTRIES, values, strict=True)), batch_size)
+    # Unchecked, because the checks take as long as a window's gathers.
+    return TensorDict._new_unsafe(dict(zip(ENTRIES, values, strict=True)), batch_size=torch.Size(batch_size))
 
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:

@@ -7,10 +7,11 @@ import peers
 import pytest
 import throughput
 import torch
+from tensordict import TensorDict
 
 from tests.benchmarks.script_parts import refused
 from tests.errors import missing
-from warmprior import GaussianPrior, window_replay_buffer
+from warmprior import GaussianPrior, window_replay_buffer, window_transforms
 
 
 @pytest.mark.parametrize("name", peers.PEERS)
@@ -52,8 +53,22 @@ def test_throughput_reports_a_folder_that_is_a_file(tmp_path, capsys):
 def test_throughput_writes_every_key(tmp_path):
     results = throughputs(tmp_path, "--only", "windows_over_torch", "preconditioning_over_network")
     found = {key for key, value in results.items() if value is not None}
-    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 12
+    assert found == {"windows_over_torch", "preconditioning_over_network", "meta"} and len(results) == 13
     assert min(results["windows_over_torch"].values()) > 0 and results["preconditioning_over_network"] > 0
+
+
+def test_bare_ranges_are_all_that_a_window_holds():
+    data = throughput.steps(5, 20)
+    window = window_transforms(data, throughput.PRIOR, observation_steps=throughput.TO)
+    torch.manual_seed(0)
+    bare = throughput.bare_ranges(data, 64)()
+    torch.manual_seed(0)
+    frame = torch.randint(len(data), (64,))
+    batch = window(TensorDict({"frame": frame}, [64]))
+    names = ("actions", "steps", "forecast", "forecast_steps")
+    names = ["observation", ("vla_action", "chunk"), "action_is_pad", *(("history", name) for name in names)]
+    for name, value in zip(names, bare, strict=True):
+        assert torch.equal(batch[name], value), name
 
 
 def test_rounds_are_interleaved_and_the_first_is_dropped():

@@ -37,11 +37,11 @@ def test_windows_are_those_of_delta_timestamps(written):
     theirs = LeRobotDataset("local/test", root=root, delta_timestamps=deltas)
     data = LeRobotDemonstrations(root, observation_keys=["observation.state"]).data
     windows = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=TO)
-    transform, prior = windows.transform, PastPrior(H)
+    prior = PastPrior(H)
     assert len(data) == len(theirs) == 16
     for i in range(len(theirs)):
         item = theirs[i]
-        row = transform(data[i : i + 1].select("frame"))[0]
+        row = windows[i]
         action, pad = item["action"], item["action_is_pad"]
         assert torch.equal(row["vla_action", "chunk"], action[H:])
         assert torch.equal(row["action_is_pad"], pad[H:])

@@ -7,9 +7,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
 from tests.errors import raises
-from warmprior import ActionWindow, PastPrior, PreviewPrior, WithheldHistory, window_replay_buffer
+from warmprior import (
+    ActionWindow,
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    WithheldHistory,
+    window_replay_buffer,
+    window_transforms,
+)
 from warmprior.checks import check_finite_steps
 
 
@@ -32,15 +41,15 @@ def reference(data, window, i):
     episode = data["episode"].tolist()
     inside = [j for j in range(len(data)) if episode[j] == episode[i]]
     first, last = inside[0], inside[-1]
-    seen, remembered = len(window.observation_offsets), window.history_length
-    length = len(window.action_offsets) - remembered
+    seen, remembered, length = window.observation_steps, window.history_length, window.prediction_length
     known = length - window.chunk_length
-    action, observation = data["action"], data["observation"]
+    action = data["action"]
+    shown = {k: v for k, v in data.items(True, True) if str(k).strip("('").startswith("observation")}
     target = [action[min(j, last)] for j in range(i, i + length)]
     before = [action[j] if j >= first else torch.zeros(2) for j in range(i - remembered, i)]
     forecast = target[:known] + [torch.zeros(2)] * window.chunk_length  # nothing else of the target
     return {
-        "observation": torch.stack([observation[max(i - n, first)] for n in reversed(range(seen))]),
+        **{k: torch.stack([v[max(i - n, first)] for n in reversed(range(seen))]) for k, v in shown.items()},
         ("vla_action", "chunk"): torch.stack(target),
         "action_is_pad": torch.tensor([j > last for j in range(i, i + length)]),
         ("history", "actions"): torch.stack(before),
@@ -56,6 +65,28 @@ def check(batch, data, window):
             assert row[key].dtype == expected.dtype and torch.equal(row[key], expected), key
 
 
+def held(data, place):
+    """The same in memory, memory-mapped, or with images among the observations."""
+    if place == "memory":
+        return data
+    vector = data["observation"]
+    images = (vector[:, :, None, None] % 251).abs().to(torch.uint8).expand(-1, 3, 2, 2)
+    seen = TensorDict({"state": vector, "camera": images.contiguous()}, [len(data)])
+    data = data.copy().set("observation", seen)
+    return data if place == "images" else data.memmap()
+
+
+class Sized(GaussianPrior):
+    """A prior of any lengths."""
+
+    name = "sized-of-the-tests"
+    prediction_length = history_length = 0
+
+    def __init__(self, chunk_length, prediction_length, history_length):
+        super().__init__(chunk_length)
+        self.prediction_length, self.history_length = prediction_length, history_length
+
+
 def every_step(data):
     return TensorDict({"frame": torch.arange(len(data))}, [len(data)])
 
@@ -68,12 +99,62 @@ def every_step(data):
     longer=st.integers(0, 3),
     observation_steps=st.integers(1, 4),
     numbers=st.permutations(range(6)),
+    place=st.sampled_from(["memory", "images", "memory-mapped"]),
 )
-def test_random_episodes(lengths, horizon, further, longer, observation_steps, numbers):
-    data = steps(lengths, numbers[: len(lengths)])
+def test_random_episodes(lengths, horizon, further, longer, observation_steps, numbers, place):
+    data = held(steps(lengths, numbers[: len(lengths)]), place)
     sizes = {"prediction_length": horizon + further, "history_length": horizon + longer}
     window = ActionWindow(data, horizon, observation_steps=observation_steps, **sizes)
-    check(window(every_step(data)), data, window)
+    check(batch := window(every_step(data)), data, window)
+    buffer = window_replay_buffer(
+        data, Sized(horizon, **sizes), batch_size=5, observation_steps=observation_steps
+    )
+    assert (buffer[: len(data)] == batch).all()
+
+
+@pytest.mark.parametrize("place", ["memory", "images", "memory-mapped"])
+def test_a_buffer_of_ones_own_samples_the_same(place):
+    data, prior = held(steps([9, 20, 3]), place), PreviewPrior(3)
+    options = {"batch_size": 16, "writer": ImmutableDatasetWriter()}
+    transforms = window_transforms(data, prior, withhold=0.5, generator=torch.Generator().manual_seed(1))
+    own = TensorDictReplayBuffer(
+        storage=TensorStorage(every_step(data)),
+        transform=transforms,
+        generator=torch.Generator().manual_seed(0),
+        **options,
+    )
+    ours = window_replay_buffer(data, prior, batch_size=16, generator=torch.Generator().manual_seed(0))
+    ours.append_transform(WithheldHistory(0.5, generator=torch.Generator().manual_seed(1)))
+    for _ in range(3):
+        one, two = own.sample(), ours.sample()
+        assert set(one.keys(True, True)) == set(two.keys(True, True)) and (one == two).all()
+        assert one.device == two.device
+
+
+def test_steps_are_read_in_any_shape_and_by_any_index():
+    data, prior = steps([9, 20, 3]), PreviewPrior(3)
+    window, buffer = (
+        ActionWindow(data, 3, prediction_length=6),
+        window_replay_buffer(data, prior, batch_size=4),
+    )
+    whole = window(every_step(data))
+    for index in (3, -1, slice(2, 9, 3), torch.tensor([5, -2]), [4, 1]):
+        assert (buffer[index] == whole[index]).all()
+    frames = torch.randint(32, (2, 3, 5))
+    for dtype in (torch.int32, torch.int64):
+        batch = window(TensorDict({"frame": frames.to(dtype)}, frames.shape))
+        assert (
+            batch["frame"].dtype == dtype and (batch.exclude("frame") == whole[frames].exclude("frame")).all()
+        )
+    kept = TensorDict(
+        {"frame": torch.tensor([[3], [4]]), "observation": torch.ones(2), "mine": torch.ones(2)}, [2]
+    )
+    batch = window(kept)
+    assert batch is kept and torch.equal(batch["mine"], torch.ones(2)) and batch["frame"].shape == (2, 1)
+    assert torch.equal(batch["observation"], whole["observation"][3:5])
+    for wrong in (-1, 32):
+        with raises(IndexError, "'frame'", wrong, "0 to 31"):
+            window(TensorDict({"frame": torch.tensor([3, wrong])}, [2]))
 
 
 def test_episodes_that_are_too_short_for_a_warm_source_are_named():

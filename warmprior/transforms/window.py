@@ -6,7 +6,7 @@ import warnings
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
@@ -31,7 +31,8 @@ class ActionWindow(Transform):
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
             ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
-            An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
+            An observation may be an image ``[N, C, H, W]``, or several entries nested under its key. Actions,
+            and vectors in memory, are copied with what pads the ends of every episode.
         chunk_length: ``H``.
         prediction_length: ``P``; ``H`` by default.
         history_length: number of executed actions that are remembered, at least ``H``; ``H`` by default.
@@ -79,41 +80,75 @@ class ActionWindow(Transform):
             lengths = f"{chunk_length}, {prediction_length} and {history_length}"
             raise ValueError(f"need 1 <= chunk_length <= prediction_length and history_length, got {lengths}")
         self.chunk_length, self.history_length = chunk_length, history_length
+        self.prediction_length, self.observation_steps = prediction_length, observation_steps
         observations, action, episode = _checked(data, observation_key)
-        self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
-        buffers = dict(zip(self._observations, observations.values(), strict=True)) | {"action": action}
-        buffers["start"], buffers["end"] = _episode_borders(episode)
-        buffers["action_offsets"] = torch.arange(-history_length, prediction_length, device=episode.device)
-        buffers["observation_offsets"] = torch.arange(1 - observation_steps, 1, device=episode.device)
+        ordinal, first, length = _episodes(episode)
+        step = torch.arange(len(episode), device=episode.device)
+        before, behind = max(history_length, observation_steps - 1), prediction_length - 1
+        padded, outside = _padding(first, length, before, behind)
+        oldest, recent = before - history_length, before - observation_steps + 1
+        buffers = {
+            "steps": (step - first[ordinal]).unsqueeze(-1),
+            # Windows are ranges of the padded steps, which begin at these rows.
+            "rows": step + ordinal * (before + behind),
+            "action": _rows(action, padded).masked_fill_((outside < 0).unsqueeze(-1), 0)[oldest:],
+            "is_pad": (outside > 0)[before:],
+            "observation_offsets": torch.arange(1 - observation_steps, 1, device=episode.device),
+        }
+        self._ranges, self._gathered = {}, {}
+        for i, (key, value) in enumerate(observations.items()):
+            name, value = f"observation_{i}", value.detach() if value.requires_grad else value
+            if value.ndim == 2 and not isinstance(value, MemoryMappedTensor):
+                self._ranges[name], value = key, _rows(value, padded)[recent:]
+            else:  # there may be no room for a second copy
+                self._gathered[name] = key
+            buffers[name] = value
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
 
-    @torch.no_grad()  # an expert's rollouts may hold its gradients
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the windows of the sampled steps."""
         check_keys(tensordict, self.in_keys, "ActionWindow", ": see window_replay_buffer")
         frame = tensordict.get(keys.FRAME)
         if frame.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"{keys.FRAME!r} holds step numbers and must be int64, got {frame.dtype}")
-        batch, before = tensordict.batch_size, self.history_length
-        frame = frame.reshape(-1, 1)
+        windows = self._windows(frame.reshape(-1)).reshape(tensordict.batch_size)
+        return tensordict.update(windows).set(keys.FRAME, frame)  # which may have more dimensions
+
+    def _windows(self, frame: Tensor) -> TensorDict:
+        """Return the windows of some steps ``[B]``."""
         try:
-            start, end = _rows(self.start, frame), _rows(self.end, frame)
+            steps = self.steps.index_select(0, frame)
         except IndexError as error:
-            steps, last = f"{int(frame.min())} to {int(frame.max())}", len(self.start) - 1
-            raise IndexError(f"{keys.FRAME!r} has steps {steps}, but the data hold 0 to {last}") from error
-        index = frame + self.action_offsets
-        is_pad = index[:, before:] > end
-        action = _rows(self.action, index.clamp(start, end))
+            found, last = f"{int(frame.min())} to {int(frame.max())}", len(self.steps) - 1
+            raise IndexError(f"{keys.FRAME!r} has steps {found}, but the data hold 0 to {last}") from error
+        row, batch, before = self.rows.index_select(0, frame), frame.shape, self.history_length
+        action = _ranges(self.action, row, before + self.prediction_length)
         target = action[:, before:]
-        # Before the episode the gather repeats its first action, which belongs to the target: zero it.
-        executed = action[:, :before] * (index[:, :before] >= start).unsqueeze(-1)
-        history = window_history(executed, frame - start, target, self.chunk_length)
-        recent = (frame + self.observation_offsets).clamp_min(start)
-        written = ((key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items())
-        for key, value in (*written, *zip(self.out_keys[1:], (target, is_pad, history), strict=True)):
-            tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
-        return tensordict
+        group, name = keys.CHUNK
+        entries = {
+            keys.FRAME: frame,
+            group: TensorDict._new_unsafe({name: target}, batch_size=batch),
+            keys.IS_PAD: _ranges(self.is_pad, row, self.prediction_length),
+            keys.HISTORY: window_history(action[:, :before], steps, target, self.chunk_length),
+        }
+        # Unchecked, because the checks take as long as the gathers.
+        windows = TensorDict._new_unsafe(entries, batch_size=batch)
+        for name, key in self._ranges.items():
+            windows.set(key, _ranges(getattr(self, name), row, self.observation_steps))
+        if self._gathered:
+            frame = frame.unsqueeze(-1)
+            recent = (frame + self.observation_offsets).clamp_min(frame - steps)
+            for name, key in self._gathered.items():
+                windows.set(key, _rows(getattr(self, name), recent))
+        return windows
+
+
+def _ranges(values: Tensor, row: Tensor, length: int) -> Tensor:
+    """Return ranges of rows of contiguous values, ``[B, length, *]``."""
+    shape, stride = values.shape, values.stride()
+    ranges = values.as_strided((shape[0] - length + 1, length, *shape[1:]), (stride[0], *stride))
+    return ranges.index_select(0, row)
 
 
 def _rows(values: Tensor, index: Tensor) -> Tensor:
@@ -137,6 +172,7 @@ def _checked(
             f"actions must be vectors of real numbers, {keys.ACTION!r} [N, d_a], got {tuple(action.shape)} "
             f"of {action.dtype}: flatten it"
         )
+    action = action.detach()  # an expert's rollouts may hold its gradients
     if not action.is_floating_point():
         action = action.to(torch.get_default_dtype())
     observations = dict(data.select(observation_key).items(True, True, is_leaf=is_leaf_nontensor))
@@ -150,16 +186,23 @@ def _checked(
     return observations, action, episode.flatten()
 
 
-def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first and the last step of every step's episode, each ``[N]``."""
-    values, lengths = torch.unique_consecutive(episode, return_counts=True)
+def _episodes(episode: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the ordinal of every step's episode ``[N]``, and the episodes' first steps and lengths."""
+    values, ordinal, lengths = torch.unique_consecutive(episode, return_inverse=True, return_counts=True)
     numbers, times = values.unique(return_counts=True)
     if (times > 1).any():
         number = int(numbers[times > 1][0])
         raise ValueError(f"the steps of episode {number} are not contiguous: order all by episode and time")
-    last = lengths.cumsum(0) - 1
-    first = last - lengths + 1
-    return first.repeat_interleave(lengths), last.repeat_interleave(lengths)
+    return ordinal, lengths.cumsum(0) - lengths, lengths
+
+
+def _padding(first: Tensor, length: Tensor, before: int, behind: int) -> tuple[Tensor, Tensor]:
+    """Return the steps that fill the rows of padded episodes, and -1, 0 or 1 before, inside or behind."""
+    rows = length + before + behind
+    ordinal = torch.arange(len(rows), device=rows.device).repeat_interleave(rows)
+    place = torch.arange(len(ordinal), device=rows.device) - (rows.cumsum(0) - rows)[ordinal] - before
+    inside = torch.minimum(place.clamp_min(0), length[ordinal] - 1)
+    return first[ordinal] + inside, (place - inside).sign()
 
 
 def window_transforms(
@@ -224,8 +267,7 @@ def window_replay_buffer(
 ) -> TensorDictReplayBuffer:
     """Return a replay buffer that samples training windows from demonstrations.
 
-    It stores only step numbers; :class:`ActionWindow` gathers the windows, which is faster than reading whole
-    steps.
+    Its storage holds step numbers, and :class:`ActionWindow` gathers the windows when they are read.
 
     Args:
         data: contiguous normalised steps ``[N]``, see :class:`ActionWindow`.
@@ -247,20 +289,40 @@ def window_replay_buffer(
         (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
-    windows = window_transforms(data, prior, generator=generator, **options)
-    window = windows[0]
-    frames = torch.arange(len(data), device=window.start.device)
-    if isinstance(prior, PastPrior) and (reach := int((frames - window.start).max())) < prior.chunk_length:
+    window, *others = window_transforms(data, prior, generator=generator, **options)
+    if isinstance(prior, PastPrior) and (reach := int(window.steps.max())) < prior.chunk_length:
         words = f"no episode has more than {reach + 1} steps, so {prior} is never warm: shorten the chunk"
         warnings.warn(words, stacklevel=1)  # from one place, so the two buffers of a training warn once
     return TensorDictReplayBuffer(
-        # The sampler draws on the storage's device, where the generator must be too.
-        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
+        storage=_WindowStorage(window),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
-        transform=windows,
+        transform=Compose(*others) if others else None,
         generator=generator,
     )
+
+
+class _WindowStorage(TensorStorage):
+    """A storage of steps that are read as their windows: a buffer's transforms take as long as the gathers.
+
+    It names no device where draws are on it anyway, for TorchRL then moves nothing.
+    """
+
+    def __init__(self, window: ActionWindow) -> None:
+        self.window = window
+        self.frames = torch.arange(len(window.steps), device=window.steps.device)
+        device = self.frames.device
+        named = None if device == torch.get_default_device() else device
+        super().__init__(
+            TensorDict({keys.FRAME: self.frames}, [len(self.frames)], device=named), device="auto"
+        )
+
+    def get(self, index: Any) -> TensorDictBase:
+        """Return the windows of some steps."""
+        frame = self.frames[index]
+        if frame.ndim == 1:
+            return self.window._windows(frame)
+        return self.window._windows(frame.reshape(-1)).reshape(frame.shape)
 
 
 def without_images(data: TensorDictBase) -> TensorDictBase:
