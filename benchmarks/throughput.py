@@ -242,6 +242,55 @@ def steps_per_second(
     return {name: calls / statistics.median(seconds) for name, seconds in rounds}
 
 
+def averaging_step_of(network: nn.Module, batch: int, *, compiled: bool) -> Callable[[], None]:
+    """Return a training step on random numbers that averages the weights, if compiled in bfloat16."""
+    if compiled:
+        network.compile()
+    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
+    weights: list[torch.Tensor] = list(network.parameters())
+    averages = [weight.detach().clone() for weight in weights]
+    shapes = (batch,), (batch, H, D_A), (batch, TO, D_O)
+    t, a, o = (torch.rand(shape) for shape in shapes)
+
+    def step() -> None:
+        with torch.autocast("cpu", torch.bfloat16, enabled=compiled, cache_enabled=False):
+            loss = network(t, a, o).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(averages, weights, 0.005)
+
+    return step
+
+
+def default_network() -> nn.Module:
+    """Return the network that `train_policy` trains by default."""
+    return precondition(small_network(), steps(100, 150), PRIOR)
+
+
+def default_step_over_network(clock: Clock) -> dict[str, float]:
+    """Measure a training step of the default network over a bare one that averages its weights too."""
+    ratio_by_kind, data = {}, steps(100, 150)
+    for batch, compiled in ((128, False), (256, False), (128, True)):
+        actor = WarmPriorActor(default_network(), PRIOR)
+        config = TrainingConfig(batch_size=batch, precision="bf16" if compiled else "float32")
+        with tempfile.TemporaryDirectory() as folder:
+            ours = BehaviourCloning(actor, data, config, folder, compile=compiled)
+            actor.train()
+            bare = averaging_step_of(default_network(), batch, compiled=compiled)
+            name = f"{batch}, bf16 and compiled" if compiled else str(batch)
+            ratio_by_kind[name] = clock.ratio(ours.step, bare, calls=10)
+    return ratio_by_kind
+
+
+def matrix_peak(clock: Clock, size: int = 1024) -> float:
+    """Measure how many 10^9 operations per second products of large float32 matrices take."""
+    one, two = torch.rand(2, size, size)
+    (seconds,) = clock.times(partial(torch.mm, one, two), calls=5)
+    return 2 * size**3 / min(seconds) / 1e9
+
+
 def preconditioning_over_network(clock: Clock) -> float:
     network = precondition(small_network(), steps(400, 200), PRIOR)
     return clock.ratio(step_of(network), step_of(small_network()), calls=20)
@@ -304,8 +353,8 @@ def _passes(network: nn.Module, inputs: tuple[torch.Tensor, ...], nfe: int) -> N
 
 
 @torch.no_grad()
-def actor_over_network(clock: Clock) -> dict[str, float]:
-    network = paper_network().eval()
+def actor_over_network(clock: Clock, make: Callable[[], nn.Module] = paper_network) -> dict[str, float]:
+    network = make().eval()
     actor = WarmPriorActor(network, PRIOR).eval()
     data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
     ratio_by_nfe = {}
@@ -423,6 +472,9 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "ddp_efficiency": (ddp_efficiency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),
+    "default_step_over_network": (default_step_over_network, "<= 1.25"),
+    "default_actor_over_network": (partial(actor_over_network, make=default_network), "<= 1.5"),
+    "matrix_peak": (matrix_peak, ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
     "batched_chunk_step": (batched_chunk_step, "<= 1.15"),

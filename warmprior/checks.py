@@ -100,6 +100,8 @@ def check_device(device: torch.device | str) -> None:
 def check_shape(name: str, value: Any, expected: Sequence[int | str]) -> None:
     """Raise ValueError if a tensor or array has another shape; a named dimension may have any size."""
     shape = tuple(value.shape)
+    if shape == tuple(expected):
+        return
     pairs = zip(shape, expected, strict=False)
     if len(shape) != len(expected) or any(isinstance(n, int) and size != n for size, n in pairs):
         raise ValueError(f"{name} has shape {list(shape)}, expected [{', '.join(map(str, expected))}]")

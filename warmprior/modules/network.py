@@ -75,12 +75,13 @@ class VelocityNetwork(nn.Module, Registered):
         """Raise ValueError unless chunks ``[B, P, d_a]`` and observations ``[B, To, d_o]`` fit."""
         self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
+        if isinstance(observation, Tensor) and tuple(observation.shape[1:]) == expected:
+            return
         built = f"{type(self).__name__} was built for observations [B, To, d_o] with (To, d_o) = {expected}"
         if isinstance(observation, TensorDictBase):
             entries = sorted(map(str, observation.keys(True, True)))
             raise ValueError(f"{built}, got the entries {entries}: write a network that encodes them")
-        if tuple(observation.shape[1:]) != expected:
-            raise ValueError(f"{built}, got {tuple(observation.shape)}")
+        raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """Encode an observation once, before the field is evaluated many times; by default return it.
@@ -107,7 +108,8 @@ def velocity_field(
     The observations, ``[B, To, *]`` or a tensordict, are encoded once. The network computes in its own dtype;
     the path is integrated, and its error measured, in that of the actions.
     """
-    dtype, encoding = precision_of(network), encoded(network, observation)
+    dtype = precision_of(network)
+    encoding = _encoded(network, observation, dtype)
     if dtype is None:
         return lambda t, a: network(t, a, encoding)
     return lambda t, a: network(t.to(dtype), a.to(dtype), encoding).to(a.dtype)
@@ -115,7 +117,11 @@ def velocity_field(
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
     """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
-    dtype, encodes = precision_of(network), getattr(network, "encodes", False)
+    return _encoded(network, observation, precision_of(network))
+
+
+def _encoded(network: nn.Module, observation: Any, dtype: torch.dtype | None) -> Any:
+    encodes = getattr(network, "encodes", False)
 
     def cast(value: Tensor) -> Tensor:
         # Vectors [B, To, d] may be integers or flags; what is encoded, such as images, stays as it is.

@@ -300,7 +300,8 @@ class ODEActor(TensorDictModuleBase):
     ) -> TensorDictBase:
         """Write the chunk; ``sigma``, 1 by default, is the source's deviation, which guidance uses."""
         check_keys(tensordict, self.in_keys[:2], "ODEActor")
-        check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
+        if self.guidance is not None:
+            check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
         a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)
         velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:
