@@ -50,6 +50,9 @@ throughput: install
 gpu: install
 	$(BIN)/python benchmarks/gpu.py $(if $(PART),--part $(PART)) $(ARGS)
 
+# Bytecode is written even where the environment says no: the tests' processes would compile all again.
+test test-slow test-ulp: export PYTHONDONTWRITEBYTECODE :=
+
 # A process per core; tests of one file share a process, and the policies that they train.
 PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile
 

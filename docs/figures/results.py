@@ -10,6 +10,7 @@ that they share. Differences pair what the same seed played.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,7 @@ def lengths_table() -> str:
     return "\n".join(text) + "\n"
 
 
+@cache
 def outcomes_by_length(runs: tuple[str, str], source: str, nfe: int) -> dict[str, np.ndarray]:
     """Return outcomes of a source and the Gaussian one, ``[lengths, seeds, episodes]``, of common seeds."""
     rows = concat([with_own_noise(read_played(run)).assign(run=run) for run in runs])

@@ -29,12 +29,20 @@ class Inline:
         pass
 
 
+def sketch(figure, path, **options):
+    """To arrange what is drawn takes most of a chart's time."""
+    figure.set_layout_engine("none")
+    figure.canvas.print_figure(path, dpi=20)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def inline(request, short_episodes):
-    """Jobs are computed here, and no video is made, unless a test asks for it."""
+    """Jobs are computed here, charts are sketched, and no video is made, unless a test asks for it."""
     if request.path.name == "test_jobs.py":
         yield
         return
+    from matplotlib.figure import Figure
+
     from lab import jobs, pictures
     from lab import policies as common
 
@@ -42,6 +50,8 @@ def inline(request, short_episodes):
         local = jobs.Local
         patch.setattr(jobs, "Local", Inline)
         patch.setattr(pictures, "rendering_backend", lambda: None)
+        if request.path.name != "test_plots.py":  # there they are looked at
+            patch.setattr(Figure, "savefig", sketch)
         yield local
     for cached in (common.cached_task, common.prepared, common.simulator):
         cached.cache_clear()

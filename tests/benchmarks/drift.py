@@ -117,6 +117,13 @@ class Widening(PastPrior, torch.nn.Module):
 
 def arguments(out, **more):
     values = {"task": f"{__name__}:task", "out": out, "prior": ["gaussian", "past", "preview"], "chunk": H}
-    values |= {"iterations": 20, "batch_size": 16, "learning_rate": 1e-2, "checkpoints": 2, "log_every": 5}
+    values |= {
+        "iterations": 20,
+        "batch_size": 16,
+        "learning_rate": 1e-2,
+        "checkpoints": 2,
+        "log_every": 5,
+        "save_every": 10,
+    }
     values |= {"hidden_dim": 16, "episodes": 7, "seeds": 2, "nfe": [3, 1], "envs": 1, "logger": "none"}
     return command_line(**values | more)

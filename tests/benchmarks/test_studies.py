@@ -1,5 +1,7 @@
+import importlib
 import json
 import shutil
+from functools import partial
 from itertools import product
 
 import budget
@@ -24,6 +26,17 @@ from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import Task, load_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_steps():
+    """Flows are measured in few steps: what is looked at here is what becomes of the numbers."""
+    with pytest.MonkeyPatch.context() as patch:
+        for place in ("lab.measures.curvature", "curvature.flow_paths", "navigation1d.flow_paths"):
+            module, name = place.rsplit(".", 1)
+            measure = getattr(importlib.import_module(module), name)
+            patch.setattr(place, partial(measure, n_steps=10))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +106,7 @@ def test_a_seed_that_fails_costs_no_report_of_the_others(priors, tmp_path, monke
 
     monkeypatch.setattr(common, "train_policy", failing)
     out = tmp_path / "out"
-    assert sigma.main(drift.arguments(out, prior=priors, nfe=1)) == 2
+    assert sigma.main(drift.arguments(out, prior=priors, sigma=[1.5, 0.5], nfe=1)) == 2
     report, rows = (out / "report.md").read_text(), stored(out)
     assert "seed 1: train: the loss became nan" in report and "| Gaussian source | 1 |" in report
     assert {(row["prior"], row["seed"]) for row in rows} == {("gaussian", 0), ("past", 0), ("past", 1)} & {

@@ -1,6 +1,4 @@
-import os
-import subprocess
-import sys
+import importlib.util
 from contextlib import nullcontext
 
 import pytest
@@ -11,11 +9,13 @@ from torchrl.envs import TransformedEnv
 
 from lab.tasks import navigation_task
 from tests.errors import raises
+from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
+from warmprior.data import RobomimicDemonstrations
 from warmprior.deploy import AsyncExecutor
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import NetworkOptions, TrainingConfig, load_policy, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, evaluate, load_policy, train_policy
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
@@ -95,31 +95,23 @@ def test_a_replay_buffer_that_has_overwritten_steps_is_refused():
             train_policy(buffer, PastPrior(4), **options)
 
 
-BARS = """
-import sys
-from pathlib import Path
-from tests.data.synthetic import write_robomimic_file
-from tests.rl.training_parts import make_actor, make_env, make_training
-from tests.training.test_train import CONFIG, NETWORK, PastPrior, navigation_task, train_policy
-from warmprior.data import RobomimicDemonstrations
-from warmprior.training import evaluate
-
-folder = Path(sys.argv[1])
-train_policy(navigation_task(), PastPrior(4), network=NETWORK, training=CONFIG, description="train")
-make_training(folder / "rl", environment_steps=90, collection={"description": "agent"}).run()
-evaluate(make_actor(), make_env(0), episodes=2, first_seed=0, description="play")
-write_robomimic_file(folder / "images.hdf5", lengths=(30,))
-RobomimicDemonstrations(folder / "images.hdf5", image_keys=("agentview_image",))
-"""
-
-
-def test_the_environment_turns_bars_off(tmp_path):
-    pytest.importorskip("h5py")
-    env = os.environ | {"TQDM_DISABLE": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", BARS, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
-    assert done.returncode == 0, done.stderr
-    assert not [name for name in ("train", "agent", "play", "read images.hdf5") if f"{name}:" in done.stderr]
+@pytest.mark.parametrize("turned_off", [False, True])
+def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsys):
+    write_robomimic_file = pytest.importorskip("tests.data.synthetic").write_robomimic_file
+    if turned_off:
+        monkeypatch.setenv("TQDM_DISABLE", "1")
+    spec = importlib.util.find_spec("tqdm.std")
+    tqdm = importlib.util.module_from_spec(spec)  # a second one: it reads the environment once
+    spec.loader.exec_module(tqdm)
+    monkeypatch.setattr("warmprior.io.progress.tqdm", tqdm.tqdm)
+    train_policy(navigation_task(), PastPrior(4), network=NETWORK, training=CONFIG, description="train")
+    make_training(tmp_path, environment_steps=90, collection={"description": "agent"}).run()
+    evaluate(make_actor(), make_env(0), episodes=2, first_seed=0, description="play")
+    write_robomimic_file(tmp_path / "images.hdf5", lengths=(30,))
+    RobomimicDemonstrations(tmp_path / "images.hdf5", image_keys=("agentview_image",))
+    said = capsys.readouterr().err
+    shown = [f"{name}:" in said for name in ("train", "agent", "play", "read images.hdf5")]
+    assert shown == [not turned_off] * 4
 
 
 def test_what_does_not_exist_is_refused_with_what_does():
