@@ -26,6 +26,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
+from warmprior.modules.registry import from_config
 
 PATHS = [LinearInterpolant(), TrigonometricInterpolant(), PolynomialInterpolant(3.0)]
 
@@ -197,8 +198,12 @@ def test_moments_given_the_observation_are_those_of_what_least_squares_leave():
             assert found.tolist() == pytest.approx(list(expected), rel=1e-3, abs=1e-4)
     assert (fitted.target_variance > 1.2 * fitted.given_target_variance)[0].all()
     marginal = SourceMoments.fit(batch, prior, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(marginal.given_covariance, marginal.covariance)
-    assert torch.equal(marginal.covariance, fitted.covariance)
+    assert torch.equal(marginal.covariance, fitted.covariance) and not marginal.conditional
+    # A policy that is built from its configuration takes them from its weights.
+    network = PreconditionedNetwork(VelocityMLP(2, 3, 3, hidden_dim=8), moments=fitted)
+    again = from_config(VelocityNetwork, network.config())
+    again.load_state_dict(network.state_dict())
+    assert torch.equal(again.moments.given_covariance, fitted.given_covariance)
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])

@@ -61,11 +61,6 @@ class SourceMoments(nn.Module):
         [True, True, True, True, False, False, False, False]
     """
 
-    positive = (
-        *("source_variance", "target_variance", "conditional_deviation"),
-        *("given_source_variance", "given_target_variance", "given_conditional_deviation"),
-    )
-
     def __init__(
         self,
         source_mean: Tensor,
@@ -78,6 +73,7 @@ class SourceMoments(nn.Module):
     ) -> None:
         super().__init__()
         second = (source_variance, target_variance, covariance)
+        self.conditional = given is not None
         moments = (source_mean, target_mean, *second, *(given or ()))
         shapes = [tuple(value.shape) for value in moments]
         if len(set(shapes)) > 1 or source_mean.ndim != 2:
@@ -86,23 +82,30 @@ class SourceMoments(nn.Module):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
         # Copies, so that a tensor given twice does not become one buffer under two names.
         self.source_mean, self.target_mean = (nn.Buffer(mean.clone()) for mean in moments[:2])
-        for prefix, (source, target, covariance) in (("", second), ("given_", given or second)):
-            v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source, target))
+        for prefix, (*variances, c) in {"": second, **({"given_": given} if given else {})}.items():
+            v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in variances)
             limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
-            c = covariance.double().clamp(-limit, limit)
+            c = c.double().clamp(-limit, limit)
             # The target's deviation given the source, in float64: lower precisions would lose the difference.
             q = (v1 - c.square() / v0).sqrt()
             for name, value in zip((*_SECOND, "conditional_deviation"), (v0, v1, c, q), strict=True):
                 self.register_buffer(prefix + name, value.to(source_mean.dtype))
 
-    def config(self) -> None:
-        """Return nothing: the values are buffers, and replace those of :meth:`identity`."""
+    @property
+    def positive(self) -> list[str]:
+        """The names of the buffers that are scales."""
+        names = ("source_variance", "target_variance", "conditional_deviation")
+        return [prefix + name for prefix in (("", "given_") if self.conditional else ("",)) for name in names]
+
+    def config(self) -> dict[str, bool]:
+        """Return the further arguments of :meth:`identity`; the values themselves are buffers."""
+        return {"conditional": self.conditional}
 
     @classmethod
-    def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
+    def identity(cls, prediction_length: int, action_dim: int, conditional: bool = False) -> SourceMoments:
         """Return moments of independent standard normal ends, to be replaced by loading a state dict."""
         zero, one = (f(prediction_length, action_dim) for f in (torch.zeros, torch.ones))
-        return cls(zero, zero, one, one, zero)
+        return cls(zero, zero, one, one, zero, given=(one, one, zero) if conditional else None)
 
     @classmethod
     @torch.no_grad()
@@ -224,8 +227,8 @@ class PreconditionedNetwork(VelocityNetwork):
 
     Args:
         network: the network :math:`F`, or its ``config()``.
-        moments: the moments of the prior's source and the targets; by default those of an independent
-            standard normal source and target; loading a state dict replaces them.
+        moments: the moments of the prior's source and the targets, or their ``config()``; by default those
+            of an independent standard normal source and target; loading a state dict replaces them.
         trend: the trend of the resting action, or its ``config()``. It gives :math:`E[a_0 | o]` and
             :math:`E[a_1 | o]` in place of the means above; the moments are then those of the remainder.
         interpolant: the path of the loss, or its ``config()``; linear by default.
@@ -251,7 +254,7 @@ class PreconditionedNetwork(VelocityNetwork):
         self,
         network: VelocityNetwork | dict[str, Any],
         *,
-        moments: SourceMoments | None = None,
+        moments: SourceMoments | dict[str, Any] | None = None,
         trend: PoseTrend | dict[str, Any] | None = None,
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
@@ -272,7 +275,9 @@ class PreconditionedNetwork(VelocityNetwork):
                 "evaluate it: choose another interpolant"
             )
         shape = (network.prediction_length, network.action_dim)
-        self.moments = SourceMoments.identity(*shape) if moments is None else moments
+        if not isinstance(moments, SourceMoments):
+            moments = SourceMoments.identity(*shape, **(moments or {}))
+        self.moments = moments
         self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
         check_shape("a moment for the network's chunks", self.moments.covariance, shape)
         if self.trend is not None:
@@ -315,6 +320,8 @@ class PreconditionedNetwork(VelocityNetwork):
             )
 
         best, scale, remainder = moments("")
+        if not self.moments.conditional:
+            return best, scale, remainder
         slope = moments("given_")[0]
         return slope, scale, torch.hypot(remainder, (best - slope) / scale)
 
