@@ -44,6 +44,7 @@ from warmprior import (
     window_replay_buffer,
 )
 from warmprior.data import LeRobotDemonstrations
+from warmprior.deploy import export_policy, load_exported
 from warmprior.envs import RobosuiteEnv
 from warmprior.io.distributed import joined, rank
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
@@ -367,6 +368,19 @@ def actor_over_network(clock: Clock, make: Callable[[], nn.Module] = paper_netwo
     return ratio_by_nfe
 
 
+@torch.no_grad()
+def exported_over_passes(clock: Clock) -> float:
+    network = default_network().eval()
+    with tempfile.TemporaryDirectory() as folder:
+        path = export_policy(WarmPriorActor(network, PRIOR, nfe=3), Path(folder) / "policy.pt2")
+        exported = load_exported(path)
+    data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
+    alone = data[0]  # an exported policy decides for one robot
+    return clock.ratio(
+        partial(exported.forward, alone), partial(_passes, network, (t, a, data["observation"]), 3), calls=20
+    )
+
+
 # Control steps
 
 
@@ -474,6 +488,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "default_step_over_network": (default_step_over_network, "<= 1.25"),
     "default_actor_over_network": (partial(actor_over_network, make=default_network), "<= 1.5"),
+    "exported_over_passes": (exported_over_passes, "<= 0.35"),
     "matrix_peak": (matrix_peak, ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
