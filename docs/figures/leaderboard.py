@@ -159,7 +159,7 @@ def table(sets: Sets) -> str:
     """Return the standings in Markdown."""
     frame = standings(sets)
     names = [name for name in ("mean", "best noise", *sets) if frame[name].notna().any()]
-    text = [f"| rank | method | NFE | {' | '.join(names)} | ahead : behind |"]
+    text = [f"| rank | method | NFE | {' | '.join(names)} | ahead:behind |"]
     text.append("|---" * (4 + len(names)) + "|")
     for _, row in frame.iterrows():
         place = f"{row['rank']:.0f} ({row['rank_low']:.0f}-{row['rank_high']:.0f})"
@@ -175,7 +175,7 @@ def one_seed_table() -> str:
     rows = trials().query("seed == 0")
     rates = rows.groupby(["source", "nfe", "set"])["success_rate"].mean().groupby(["source", "nfe"])
     means = 100 * rates.mean()[rates.size() == len(HUMAN)]
-    text = ["| method | NFE 9 | ahead : behind | NFE 1 | ahead : behind |", "|---" * 5 + "|"]
+    text = ["| method | NFE 9 | ahead:behind | NFE 1 | ahead:behind |", "|---" * 5 + "|"]
     for source in (GAUSSIAN, *sorted({source for source, _ in means.index} - {*standings()["source"]})):
         cells = []
         for setting in ((source, 9), (source, 1)):

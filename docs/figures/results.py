@@ -189,7 +189,7 @@ CHOICES = {"long training": lambda outcomes: outcomes[-1], "better length": bett
 
 def sets_table() -> str:
     """Return the mean success of warm sources over all sets in Markdown, beside the Gaussian source's."""
-    text = [f"| | NFE | {' | '.join(f'{choice} | Gaussian | ahead : behind' for choice in CHOICES)} |"]
+    text = [f"| | NFE | {' | '.join(f'{choice} | Gaussian | ahead:behind' for choice in CHOICES)} |"]
     text.append("|---" * (2 + 3 * len(CHOICES)) + "|")
     for source in WARM:
         for nfe, *pair in zip((9, 3, 1), *(all_lengths(source, c) for c in CHOICES.values()), strict=True):

@@ -125,8 +125,8 @@ class Comparison:
 
     def __str__(self) -> str:
         """Return the trainings ahead and behind, with the p-value if there are enough of them."""
-        chance = f", {self.chance}" if self.trainings >= ENOUGH_TRAININGS else ""
-        return f"{self.ahead} : {self.behind}{chance}"
+        p = self.chance.replace("p = ", "").replace("p < ", "<")
+        return f"{self.ahead}:{self.behind}" + (f" ({p})" if self.trainings >= ENOUGH_TRAININGS else "")
 
     @property
     def chance(self) -> str:
