@@ -79,6 +79,7 @@ def compare(
     for number, stored in enumerate(rows, 1):
         facts_of_cells = played[stored["policy"]].values()
         matches = any(facts <= stored.items() for facts in facts_of_cells)
+        matches &= stored.get("first_episode") == evaluation.starts(stored["seed"]).start
         if stored["episodes"] != evaluation.episodes or not matches:
             raise ValueError(
                 f"{path}, line {number} is no row of this run: remove that line, and continue with --resume"

@@ -249,5 +249,7 @@ class Jobs:
             self._failed[job.group] = f"{what}: {reason}" if what else str(reason)
             self.say(f"FAILED {job.group}: {self._failed[job.group]}")
         before = len(self._waiting)
-        self._waiting = [other for other in self._waiting if other.group != job.group]
+        # Its group is left out, and what waits for it, whose group may be another.
+        left_out = [other for other in self._waiting if other.group == job.group or other.after is job]
+        self._waiting = [other for other in self._waiting if other not in left_out]
         return 1 + before - len(self._waiting)

@@ -130,6 +130,7 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
         *keys,
         *FACTS,
         "solved",
+        "first_episode",
         "seed",
         "iterations",
         "checkpoint",
@@ -180,10 +181,6 @@ def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame
         place.remove("temperature")
     rows_of_first = rows[rows["method"] == first].set_index(place)
     first_rows = rows_of_first.reindex(pd.MultiIndex.from_frame(rows[place])).set_index(rows.index)
-    other = rows["method"] != first
-    rows["gain"] = (rows["success"] - first_rows["success"]).where(other)
-    deviations = [part.get("success_std", math.nan) for part in (rows, first_rows)]
-    rows["one_sigma"] = rows["gain"] > deviations[0] + deviations[1]
     # Episodes are paired by their seeds, and trainings by theirs.
     both = seeds[seeds["method"] != first].merge(
         seeds[seeds["method"] == first], on=[*place, "seed"], suffixes=("", "_first")
@@ -198,6 +195,9 @@ def _beside(rows: DataFrame, seeds: DataFrame, keys: Sequence[str]) -> DataFrame
     rows["gains"] = [
         [float(pairs.mean()) for pairs in of] if isinstance(of, list) else [] for of in rows["differences"]
     ]
+    rows["gain"] = [np.mean(gains) if gains else math.nan for gains in rows["gains"]]
+    deviations = [part.get("success_std", math.nan) for part in (rows, first_rows)]
+    rows["one_sigma"] = rows["gain"] > deviations[0] + deviations[1]
     rows = rows.drop(columns="differences")
     # A flow does not depend on NFE, and the first method may not be played at this one.
     flows = seeds[seeds["method"] == first].groupby("setting")[RELATIVE].mean()
@@ -293,7 +293,7 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
     """
     first, settings = baseline(rows), rows["setting"].unique()
     best, chances = [], []
-    sums = {"success": "mean", "gains": "sum", "task": "size"}  # a sum of lists joins them
+    sums = {"success": "mean", "gains": list, "task": "size"}
     for nfe, group in _placed(rows).sort_values("nfe", ascending=False).groupby("column", sort=False):
         totals = group.sort_index().groupby("method", sort=False).agg(sums)
         totals = totals[totals["task"] == totals["task"].max()]  # methods that were played in all settings
@@ -302,8 +302,9 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
         others = totals.drop(first, errors="ignore")
         if first in totals.index and len(others):
             name = others["success"].idxmax()
-            gain = totals.loc[name, "success"] - totals.loc[first, "success"]
-            chances.append(f"{name} {gain:+.1%} at {nfe} ({verdict(totals.loc[name, 'gains'])})")
+            gains = [of for of in totals.loc[name, "gains"] if of]
+            gain = np.mean([np.mean(of) for of in gains]) if gains else math.nan
+            chances.append(f"{name} {gain:+.1%} at {nfe} ({verdict(*gains)})")
     where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
     lines = [
         f"{_count(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
@@ -313,16 +314,17 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
     return "\n".join(textwrap.fill(line, width, subsequent_indent="  ") for line in lines)
 
 
-def verdict(gains: Sequence[float]) -> str:
-    """Return in words whether the gains of several trainings can be chance.
+def verdict(*gains: Sequence[float]) -> str:
+    """Return in words whether the gains of several trainings can be chance, a sequence per setting.
 
-    >>> verdict([0.1, 0.2, 0.1, 0.3, 0.2, 0.1]), verdict([0.1])
+    >>> verdict([0.1, 0.2, 0.1], [0.3, 0.2, 0.1]), verdict([0.1])
     ('p = 0.031, 6 trainings', '1 training, too few to judge')
     """
-    count = _count(len(gains), "training")
-    if len(gains) < ENOUGH_TRAININGS:
+    trainings = sum(map(len, gains))
+    count = _count(trainings, "training")
+    if trainings < ENOUGH_TRAININGS:
         return f"{count}, too few to judge"
-    return f"p = {sign_flip_test(gains):.2g}, {count}"
+    return f"p = {sign_flip_test(*gains):.2g}, {count}"
 
 
 def terminal_table(results: DataFrame, top_k: int, width: int = 120) -> str:

@@ -64,7 +64,8 @@ class Spread:
     Attributes:
         trainings: the design effect of trainings; 1 if unknown.
         starts: the design effect of shared starts, at least 1; 1 if each training has its own.
-        freedom: degrees of freedom of the estimate: trainings minus cells; 0 without any second training.
+        freedom: degrees of freedom of the estimate: trainings minus cells, of cells whose values vary; 0
+            without any second training.
     """
 
     trainings: float
@@ -87,14 +88,13 @@ def spread_of(cells: Sequence[np.ndarray], shared_starts: bool = False) -> Sprea
         (36, 1)
     """
     by_training = by_start = 0.0
-    freedom = sum(len(cell) - 1 for cell in cells)
-    starts = sum(cell.shape[1] - 1 for cell in cells) if shared_starts else 0
-    for cell in cells:
+    varied = [cell for cell in cells if cell.var() > 0]  # the others say nothing of the spread
+    freedom = sum(len(cell) - 1 for cell in varied)
+    starts = sum(cell.shape[1] - 1 for cell in varied) if shared_starts else 0
+    for cell in varied:
         n, m = cell.shape
-        # A cell without any variance says nothing of the spread.
-        if (variance := cell.var()) > 0:
-            by_training += m * ((cell.mean(1) - cell.mean()) ** 2).sum() / variance
-            by_start += n * ((cell.mean(0) - cell.mean()) ** 2).sum() / variance
+        by_training += m * ((cell.mean(1) - cell.mean()) ** 2).sum() / cell.var()
+        by_start += n * ((cell.mean(0) - cell.mean()) ** 2).sum() / cell.var()
     return Spread(
         float(by_training / freedom) if freedom else 1.0,
         float(max(1.0, by_start / starts)) if starts else 1.0,
@@ -129,19 +129,21 @@ def interval(cells: Sequence[np.ndarray], spread: Spread, confidence: float = 0.
     return float(mean - quantile * error), float(mean + quantile * error)
 
 
-def sign_flip_test(differences: Sequence[float]) -> float:
+def sign_flip_test(*cells: Sequence[float]) -> float:
     """Return the two-sided p-value of a mean difference between two methods, over trainings.
 
-    If the methods are equal, a training's difference is as likely to have the other sign. The test compares
-    the mean with those of all signs, exactly up to 13 trainings and with 10,000 draws beyond. Three
-    trainings can never be below 0.25, six reach 0.03, and twelve 0.0005.
+    Each cell has the differences of its trainings, and all cells have the same weight. If the methods are
+    equal, a training's difference is as likely to have the other sign. The test compares the mean with those
+    of all signs, exactly up to 13 trainings and with 10,000 draws beyond. Three trainings can never be below
+    0.25, six reach 0.03, and twelve 0.0005.
 
     Examples:
         >>> from lab.statistics import sign_flip_test
-        >>> sign_flip_test([0.1, 0.2, 0.3]), sign_flip_test([0.1, 0.2, 0.3, 0.1, 0.2, 0.1])
+        >>> sign_flip_test([0.1, 0.2, 0.3]), sign_flip_test([0.1, 0.2, 0.3], [0.1, 0.2, 0.1])
         (0.25, 0.03125)
     """
-    values = np.asarray(differences, dtype=float)
+    # Their sum is the mean over cells of the means over trainings.
+    values = np.array([difference / len(cell) for cell in cells for difference in cell], dtype=float)
     if len(values) < 2 or not values.any():
         return 1.0
     result = permutation_test(

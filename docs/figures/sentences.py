@@ -112,7 +112,8 @@ def sentences() -> dict[str, list[str]]:
             f"{span(few)} points more at one evaluation",
             f"({past_once.in_trainings}, {past_once.chance})",
             f"{span(short)} points less at one evaluation",
-            f"{long_rates[0]}% and {long_rates[1]}% at nine, three and one",
+            f"{long_rates[0]}% and {long_rates[1]}% at nine, three and one "
+            f"({', '.join(c.chance for c in long)})",
             f"each at its better length of training, {better_rates[0]} and {better_rates[1]}",
             f"a learned source, the decoder of a CVAE, solves {rates[CVAE, 9]}% ({learned[9].chance})",
             f"MIP, a regression in two steps, {rates['mip', 2]} ({mip.chance})",
@@ -158,8 +159,8 @@ def sentences() -> dict[str, list[str]]:
             f"{whole(past_at_best.rates[1])} ({past_at_best.chance})",
         ],
         "results.md": [
-            f"({' and '.join(dict.fromkeys(c.chance for c in long))}), and so is correlated noise at nine "
-            f"and three ({correlated_long[0].chance} each)",
+            f"({', '.join(c.chance for c in long)} at nine, three and one), and so is correlated noise at "
+            f"nine and three ({correlated_long[0].chance} each)",
             f"With 25, WP-Past is {past_once.gain:.0f} points ahead ({past_once.in_trainings}, "
             f"{past_once.chance})",
         ],

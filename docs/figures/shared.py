@@ -153,7 +153,13 @@ def compare(first: Iterable[np.ndarray], second: Iterable[np.ndarray]) -> Compar
     by_training = np.concatenate([cell.mean(1) for cell in differences])
     rates = tuple(100 * float(np.mean([cell.mean() for cell in cells])) for cells in (first, second))
     signs = int((by_training > 0).sum()), int((by_training < 0).sum())
-    return Comparison(rates, *estimate(differences), *signs, len(by_training), sign_flip_test(by_training))
+    return Comparison(
+        rates,
+        *estimate(differences),
+        *signs,
+        len(by_training),
+        sign_flip_test(*(cell.mean(1) for cell in differences)),
+    )
 
 
 def figure(width: float, height: float, columns: int, title: str, rows: int = 1) -> tuple[Figure, list[Axes]]:

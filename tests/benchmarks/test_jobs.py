@@ -18,6 +18,7 @@ import pytest
 from lab import jobs
 from lab.jobs import Jobs
 from lab.options import Run
+from tests.benchmarks.conftest import Inline
 from tests.errors import raises
 from tests.processes import apart
 
@@ -172,3 +173,17 @@ def test_without_a_terminal_trainings_say_now_and_then_how_far_they_are(tmp_path
         status.write_text('{"iteration": 1500, "iterations": 3000}')
         started._show(bar, running)
     assert capsys.readouterr().out == "train square: 1,500 of 3,000 iterations\n"
+
+
+def test_what_waits_for_a_failed_job_is_left_out_whatever_its_group(monkeypatch, capsys):
+    monkeypatch.setattr(jobs, "Local", Inline)
+    with Jobs(Run()) as run:
+        trained = run.submit("train a policy", fail, group="a policy")
+        run.submit("film", print, "filmed", after=trained)
+        run.submit("another", print, "played")
+        assert run.wait() == {"a policy": "train: no such loss"}
+    assert "played" in (said := capsys.readouterr().out) and "filmed" not in said
+
+
+def fail():
+    raise ValueError("no such loss")

@@ -1,6 +1,7 @@
 """An exported decision: against the policy that it was exported from."""
 
 import json
+import random
 
 import pytest
 import torch
@@ -128,13 +129,25 @@ def test_what_cannot_be_exported_is_refused_in_one_sentence(uncompiled, tmp_path
 
         def distribution(self, history, observation=None):
             source = super().distribution(history)
-            return type(source)(source.loc + torch.rand(()), source.scale, source.warm)
+            return type(source)(source.loc + random.random(), source.scale, source.warm)
+
+    class Branching(PastPrior):
+        name = "branching-of-the-exported"
+
+        def mean(self, history):
+            loc, warm = super().mean(history)
+            return (2 * loc if int(history["steps"]) > 2 else loc), warm
 
     path = tmp_path / "policy.pt2"
     with raises(ValueError, "Real-Time Chunking"):
         export_policy(policy(PastPrior(4), guidance=RealTimeChunking()), path)
     with raises(ValueError, "torch.randn"):
         export_policy(policy(Uniform(4)), path)
+    with raises(ValueError, "Branching"):
+        export_policy(policy(Branching(4)), path)
+    save_policy(policy(PastPrior(4)), tmp_path)
+    with raises(ValueError, "config.json"):
+        export_policy(policy(PastPrior(4)), tmp_path / "config.pt2")
     assert not path.exists()
 
 
@@ -150,6 +163,10 @@ def test_a_file_for_another_machine_or_of_other_code_is_not_loaded(uncompiled, t
     ):
         path.with_suffix(".json").write_text(json.dumps(description | change))
         with raises(ValueError, *facts):
+            load_exported(path)
+    for damaged, fact in (([], "policy.json"), ({"program": "0"}, "inputs")):
+        path.with_suffix(".json").write_text(json.dumps(damaged))
+        with raises(ValueError, fact, "export"):
             load_exported(path)
     path.with_suffix(".json").unlink()
     with raises(FileNotFoundError, "policy.json"):
@@ -169,9 +186,25 @@ def test_the_command_exports_a_saved_policy(uncompiled, tmp_path, capsys):
 def test_native_code_decides_like_the_policy(prior, tmp_path):
     actor = policy(prior, hidden_dim=64, nfe=3)
     exported = load_exported(export_policy(actor, tmp_path / "policy.pt2"))
-    torch.testing.assert_close(
-        chunks(exported, decisions(prior)), chunks(actor, decisions(prior)), rtol=0, atol=1e-5
-    )
+    found, expected = chunks(exported, decisions(prior)), chunks(actor, decisions(prior))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+
+
+def test_entries_are_checked_and_cast_before_native_code_reads_them(uncompiled, tmp_path):
+    """The exported graph checks them itself, so the stand-in here takes anything, as native code does."""
+    actor = policy(PastPrior(4)).train()
+    exported = load_exported(export_policy(actor, tmp_path / "policy.pt2"))
+    assert actor.network.training  # the caller's policy is as before
+    data, given = next(decisions(actor.prior)), []
+    exported._run = lambda *inputs: given.extend(inputs) or torch.zeros(4, D_A)
+    wide = data.clone().set("observation", data["observation"].double().T.contiguous().T)
+    exported(wide)
+    assert all(value.is_contiguous() for value in given)
+    assert [value.dtype for value in given if value.is_floating_point()] == [torch.float32] * 4
+    torch.testing.assert_close(given[0], data["observation"])
+    for wrong in (torch.zeros(1, D_O), torch.zeros(2, D_O - 1)):
+        with raises(ValueError, "observation", D_O, 2):
+            exported(data.clone().set("observation", wrong))
 
 
 def test_torch_export_takes_a_policy_and_its_entries_as_keywords():

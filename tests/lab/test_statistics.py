@@ -92,9 +92,12 @@ def test_one_training_tells_of_its_episodes_alone_and_certainty_never():
     half = z * math.sqrt(cell.mean() * (1 - cell.mean()) / 200)
     assert spread_of([cell]).freedom == 0
     assert interval([cell], spread_of([cell])) == pytest.approx((cell.mean() - half, cell.mean() + half))
-    perfect = np.ones((1, 50))
-    low, high = interval([perfect], spread_of([perfect]))
-    assert 0.9 < low < 1 < high
+    for perfect in np.ones((1, 50)), np.ones((3, 50)):
+        low, high = interval([perfect], spread_of([perfect]))
+        assert 0.9 < low < 1 < high
+    # Cells without variance say nothing of the spread, neither of its freedom.
+    varied, _ = outcomes(rng, 3, 50)
+    assert spread_of([varied, perfect, perfect]) == spread_of([varied])
 
 
 def test_a_p_value_is_the_share_of_signs_that_are_as_far_from_zero():
@@ -104,6 +107,11 @@ def test_a_p_value_is_the_share_of_signs_that_are_as_far_from_zero():
     one_sided = (means >= differences.mean() - 1e-12).mean()
     assert sign_flip_test(differences) == pytest.approx(2 * one_sided)
     assert sign_flip_test(-differences) == pytest.approx(2 * one_sided)
+    # Cells have the same weight, however many trainings they have.
+    by_hand = np.array([0.3, -0.1, 0.2, 0.1, 0.15, 0.25]) / np.array([1, 5, 5, 5, 5, 5])
+    flipped = (np.array(list(product((1, -1), repeat=6))) * by_hand).sum(1)
+    one_sided = (flipped >= by_hand.sum() - 1e-12).mean()
+    assert sign_flip_test([0.3], [-0.1, 0.2, 0.1, 0.15, 0.25]) == pytest.approx(2 * one_sided)
     smallest = {3: 0.25, ENOUGH_TRAININGS: 2**-5, 12: 2**-11}
     for count, p in smallest.items():
         assert sign_flip_test([0.1] * count) == pytest.approx(p)

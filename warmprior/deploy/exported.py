@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import platform
@@ -17,33 +18,40 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from warmprior import keys
+from warmprior.checks import check_keys, check_shape
 from warmprior.deploy.observation import observation_shapes
-from warmprior.history import cold_history
+from warmprior.history import advance, cold_history
 from warmprior.io.files import check_regular, file_digest, read_json, write_atomic
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.generator import Drawing
-from warmprior.modules.network import uncompiled
+from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior, noise_factor
 from warmprior.modules.registry import from_config
+
+FIELDS = {
+    *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),
+    *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer"),
+}
+"""What the description of an exported policy holds."""
 
 HISTORY_ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 
 
 class _Draws(TorchFunctionMode):
-    """Lets the source take its normal draws from outside, in their order, and notes their shapes."""
+    """Lets the source take its normal draws from outside, in their order, and notes shapes and dtypes."""
 
     def __init__(self, given: Iterable[Tensor] | None = None) -> None:
         super().__init__()
         self.given = None if given is None else iter(given)
-        self.shapes: list[list[int]] = []
+        self.drawn: list[tuple[torch.Size, torch.dtype]] = []
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is not torch.randn:
             return func(*args, **(kwargs or {}))
         drawn = func(*args, **(kwargs or {})) if self.given is None else next(self.given)
-        self.shapes.append(list(drawn.shape))
+        self.drawn.append((drawn.shape, drawn.dtype))
         return drawn
 
 
@@ -79,8 +87,11 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
         The path.
 
     Raises:
-        ValueError: if the policy has guidance, a start point, an image encoder or keys of its own, or the
-            path does not end in ``.pt2``.
+        ValueError: if the policy has guidance, a start point, an image encoder or keys of its own; if the
+            program decides otherwise than the policy; or if the path does not end in ``.pt2``, or its JSON
+            file is another one.
+        TypeError: if the network is not a :class:`VelocityNetwork`.
+        RuntimeError: if no C++ compiler works here.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -91,11 +102,19 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
             ...
         ValueError: policy.onnx: the name of an exported policy ends in .pt2
     """
-    path, policy = Path(path), uncompiled(policy)
+    # A copy, because evaluation mode and the CPU are not for the caller's policy.
+    path, policy = Path(path), copy.deepcopy(uncompiled(policy))
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: the name of an exported policy ends in .pt2")
+    described = path.with_suffix(".json")
+    if described.exists() and "program" not in read_json(described):
+        raise ValueError(
+            f"{described} is no exported policy's, and would be overwritten: choose another name"
+        )
     check_usual_keys(policy, "export_policy")
     network = uncompiled(policy.network)
+    if not isinstance(network, VelocityNetwork):
+        raise TypeError(f"cannot export {type(network).__name__}: only subclasses of VelocityNetwork")
     for has, what in (
         (policy.ode.guidance is not None, "Real-Time Chunking, which needs gradients"),
         (policy.start is not None, "a start point"),
@@ -109,29 +128,48 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
         generator=None,
     ).to("cpu")
     prior = fixed.prior
-    history = cold_history([], prior.history_length, prior.prediction_length, network.action_dim)
-    observation = torch.zeros(network.observation_steps, network.observation_dim)
-    decision, entries = _Decision(fixed.eval()), [history[name] for name in HISTORY_ENTRIES]
+    decision = _Decision(fixed.eval())
     with torch.no_grad(), torch_threads(1), torch.random.fork_rng([]), TemporaryDirectory() as folder:
+        torch.manual_seed(0)
+        dtype = next((p.dtype for p in network.parameters()), torch.float32)
+        history = cold_history(
+            [], prior.history_length, prior.prediction_length, network.action_dim, dtype=dtype
+        )
+        chunk = torch.randn(history["forecast"].shape, dtype=dtype)
+        cases = [
+            (torch.randn(network.observation_steps, network.observation_dim, dtype=dtype), *values)
+            for state in (history, advance(history, chunk, torch.tensor([prior.chunk_length])))
+            for values in [[state[name] for name in HISTORY_ENTRIES]]
+        ]
         with _Draws() as noted:
-            fixed(TensorDict({fixed.observation_key: observation, keys.HISTORY: history}))
-        draws = [torch.randn(shape) for shape in noted.shapes]
-        program = torch.export.export(decision, (observation, *entries, *draws), strict=False)
-        for node in program.graph.nodes:
-            if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            data = dict(zip(HISTORY_ENTRIES, cases[0][1:], strict=True))
+            fixed(TensorDict({fixed.observation_key: cases[0][0], keys.HISTORY: TensorDict(data)}))
+        draws = [torch.randn(shape, dtype=kind) for shape, kind in noted.drawn]
+        try:
+            program = torch.export.export(decision, (*cases[0], *draws), strict=False)
+        except Exception as error:
+            raise ValueError(f"torch.export cannot follow {prior}: {_first_line(error)}") from error
+        # What is not a draw of torch.randn became a constant.
+        for case in cases:
+            if not torch.allclose(program.module()(*case, *draws), decision(*case, *draws), atol=1e-4):
                 raise ValueError(
-                    f"{prior} draws by {node.target}, and an exported policy takes the draws of torch.randn "
-                    "alone from outside: use torch.randn in its source"
+                    f"the exported program decides otherwise than the policy: let {prior} draw by "
+                    "torch.randn alone, and keep no state"
                 )
         compiled = Path(folder) / "policy.pt2"
-        torch._inductor.aoti_compile_and_package(program, package_path=str(compiled))
+        try:
+            torch._inductor.aoti_compile_and_package(program, package_path=str(compiled))
+        except Exception as error:
+            raise RuntimeError(
+                f"the policy cannot be compiled here: {_first_line(error)}. Is a C++ compiler installed?"
+            ) from error
         description = {
             "program": file_digest(compiled),
             **_machine(),
             "prior": prior.config(),
             "nfe": fixed.sampling.nfe,
             "temperature": fixed.sampling.temperature,
-            "draws": noted.shapes,
+            "inputs": [[list(value.shape), str(value.dtype)] for value in (*cases[0], *draws)],
             "observation_key": fixed.observation_key,
             "observation_steps": network.observation_steps,
             "action_dim": network.action_dim,
@@ -141,7 +179,7 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, lambda target: target.write_bytes(compiled.read_bytes()))
         text = json.dumps(description, indent=2) + "\n"
-        write_atomic(path.with_suffix(".json"), lambda target: target.write_text(text))
+        write_atomic(described, lambda target: target.write_text(text))
     return path
 
 
@@ -170,6 +208,11 @@ def load_exported(path: str | Path) -> ExportedPolicy:
     check_regular(path)
     description = read_json(path.with_suffix(".json"))
     program = path.read_bytes()
+    if not isinstance(description, dict) or (lacking := FIELDS - description.keys()):
+        lacks = (
+            f"lacks {', '.join(sorted(lacking))}" if isinstance(description, dict) else "is no description"
+        )
+        raise ValueError(f"{path.with_suffix('.json')} {lacks}: export the policy again")
     if description["program"] != hashlib.sha256(program).hexdigest():
         raise ValueError(
             f"{path} is not the program that {path.with_suffix('.json')} describes: export again"
@@ -210,7 +253,7 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
         self.observation_key = tuple(key) if isinstance(key, list) else key
         self.in_keys = [self.observation_key, *((keys.HISTORY, name) for name in HISTORY_ENTRIES)]
         self.out_keys = [keys.CHUNK]
-        self._draws = description["draws"]
+        self._inputs = [(tuple(shape), getattr(torch, kind[6:])) for shape, kind in description["inputs"]]
         self.normalizer: Normalizer | None = None
         if (stored := description["normalizer"]) is not None:
             self.normalizer = Normalizer.from_config(stored)
@@ -224,10 +267,22 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Draw the source's noise, and write the chunk ``[P, d_a]`` of one decision."""
-        generator = self.chosen_generator(generator)
-        draws = (torch.randn(shape, generator=generator) for shape in self._draws)
-        return tensordict.set(keys.CHUNK, self._run(*(tensordict.get(key) for key in self.in_keys), *draws))
+        """Draw the source's noise, and write the chunk ``[P, d_a]`` of one decision.
+
+        Raises ValueError if an entry has another shape: native code does not check what it reads.
+        """
+        check_keys(tensordict, self.in_keys, type(self).__name__)
+        generator, count = self.chosen_generator(generator), len(self.in_keys)
+        entries = []
+        for key, (shape, dtype) in zip(self.in_keys, self._inputs, strict=False):
+            check_shape(str(key), value := tensordict.get(key), shape)
+            entries.append(value.to("cpu", dtype).contiguous())
+        draws = (torch.randn(s, dtype=d, generator=generator) for s, d in self._inputs[count:])
+        return tensordict.set(keys.CHUNK, self._run(*entries, *draws))
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
 
 
 def _as_lists(normalizer: Normalizer) -> dict[str, Any]:

@@ -29,7 +29,7 @@ class _Decoded(Source):
         inputs, prior = self.inputs, self.prior
         like = {"dtype": inputs.dtype, "device": inputs.device, **given(generator=generator)}
         z = torch.randn((*inputs.shape[:-1], prior.latent_dim), **like)
-        loc = prior.decode(inputs, z if temperature == 1.0 else temperature * z)
+        loc = prior.decode(inputs, z if temperature == 1.0 else temperature * z).to(self.loc.dtype)
         return Source(loc, loc.new_full((), prior.sigma), self.warm).sample(generator, temperature)
 
 
@@ -112,7 +112,7 @@ class CVAEPrior(Prior, nn.Module):
         source = super().distribution(history, observation)
         _, width, steps = self.widths
         check_shape("the observation of CVAEPrior", observation, (*source.loc.shape[:-2], steps, width))
-        inputs = observation.flatten(-2)
+        inputs = observation.flatten(-2).to(self.decoder[0].weight.dtype)
         return _Decoded(source.loc, source.scale, source.warm, prior=self, inputs=inputs)
 
     def decode(self, inputs: Tensor, z: Tensor) -> Tensor:
@@ -133,7 +133,8 @@ class CVAEPrior(Prior, nn.Module):
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """Return the loss above on windows."""
-        inputs, target = windows[keys.OBSERVATION].flatten(-2), windows[keys.CHUNK]
+        dtype = self.decoder[0].weight.dtype
+        inputs, target = windows[keys.OBSERVATION].flatten(-2).to(dtype), windows[keys.CHUNK].to(dtype)
         inside = ~windows[keys.IS_PAD].unsqueeze(-1)
         encoded = self.encoder(torch.cat([inputs, (target * inside).flatten(-2)], -1))
         mean, log_variance = encoded.chunk(2, -1)

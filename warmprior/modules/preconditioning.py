@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.checks import check_positions, check_shape, check_whole_numbers
+from warmprior.checks import check_choice, check_positions, check_shape, check_whole_numbers
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
@@ -140,6 +140,7 @@ class SourceMoments(nn.Module):
         Raises:
             ValueError: if there are fewer than two windows, or their lengths do not fit the prior.
         """
+        check_choice("slope", slope, get_args(Slope))
         if isinstance(windows, TensorDictBase):
             batches = [windows]
         else:

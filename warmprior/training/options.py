@@ -92,6 +92,8 @@ class NetworkOptions:
         check_choice("network", self.network, _NETWORKS)
         check_choice("encoder", self.encoder, get_args(Encoder))
         check_choice("slope", self.slope, get_args(Slope))
+        if self.slope != "marginal" and not self.precondition:
+            raise ValueError(f"slope = {self.slope!r} belongs to a preconditioned network")
         check_whole_numbers(0, **given(observation_layers=self.observation_layers))
         check_positive(**given(time_frequency=self.time_frequency))
         for name in self._of_transformers():
