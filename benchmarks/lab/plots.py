@@ -122,7 +122,8 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
         if len(violin) > 1:
             axis.plot([x] * len(violin), violin["success_rate"], ".", color="black", ms=5)
         axis.text(x, -0.025, f"{k:.4g}/{n}", ha="center", va="top", fontsize=7, color="0.35")
-    dress(axis, y="success rate (posterior density; dots: trainings)")
+    dots = "; dots: trainings" if rows.groupby(["method", "group"]).size().max() > 1 else ""
+    dress(axis, y=f"success rate (posterior density{dots})")
     axis.set_ylim(-0.08, 1.0)
     save(figure, path, title)
 
