@@ -84,3 +84,17 @@ def test_it_is_built_from_its_configuration_and_only_what_it_can_read_is_read():
     for option in ("latent_dim", "hidden_dim", "beta"):
         with raises(ValueError, option, 0):
             CVAEPrior(H, **{option: 0})
+
+
+def test_data_of_another_precision_are_cast():
+    prior = prior_for(hidden_dim=8)
+    history = random_history(prior, 3, action_dim=D_A).apply(
+        lambda x: x.double() if x.is_floating_point() else x
+    )
+    with torch.no_grad():
+        source = prior.distribution(history, torch.zeros(3, 1, D_O, dtype=torch.float64))
+        assert source.sample().dtype == source.loc.dtype == torch.float64
+    data = {"observation": torch.rand(20, D_O).double(), "action": torch.rand(20, D_A).double()}
+    steps = TensorDict({**data, "episode": torch.arange(20) // 10}, [20])
+    windows = window_replay_buffer(steps, prior, batch_size=8, observation_steps=1)
+    assert prior.learning_loss(windows.sample()).isfinite()
