@@ -1,4 +1,4 @@
-"""Where the time of a run goes."""
+"""The phases of a run in wall-clock time."""
 
 from __future__ import annotations
 

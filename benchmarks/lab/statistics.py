@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import bootstrap, norm, permutation_test
+from scipy.stats import bootstrap, permutation_test
 from scipy.stats import t as student_t
 from torch import Tensor
 
@@ -55,7 +55,7 @@ def chosen_elsewhere(solved: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Spread:
-    """How far success rates vary, in units of the variance of independent episodes.
+    """The spread of success rates, in units of the variance of independent episodes.
 
     A training succeeds more or less often than another, so episodes of one training are alike. The design
     effect of trainings (Kish, 1965) is the variance of their rates over that of independent episodes.
@@ -120,11 +120,8 @@ def interval(cells: Sequence[np.ndarray], spread: Spread, confidence: float = 0.
     # One episode more of each kind, as in Wilson's interval: rates of 0 and 1 are not certain.
     variances = [effect * max(cell.var(), 1 / (cell.size + 2)) / cell.size for cell in cells]
     error = math.sqrt(sum(variances)) / len(cells)
-    quantile = (
-        student_t.ppf((1 + confidence) / 2, spread.freedom)
-        if spread.freedom
-        else norm.ppf((1 + confidence) / 2)
-    )
+    # Student's distribution with infinite freedom is the normal one.
+    quantile = student_t.ppf((1 + confidence) / 2, spread.freedom or math.inf)
     mean = float(np.mean([cell.mean() for cell in cells]))
     return float(mean - quantile * error), float(mean + quantile * error)
 

@@ -1,4 +1,4 @@
-"""What learns before the flow: once, from the windows of the flow, frozen, and kept with the policy."""
+"""Sources and start points that learn before the flow are trained once, frozen, and kept with the policy."""
 
 import dataclasses
 

@@ -34,7 +34,7 @@ FIELDS = {
     *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),
     *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer"),
 }
-"""What the description of an exported policy holds."""
+"""The entries that the description of an exported policy holds."""
 
 HISTORY_ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 
@@ -136,14 +136,11 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
             [], prior.history_length, prior.prediction_length, network.action_dim, dtype=dtype
         )
         chunk = torch.randn(history["forecast"].shape, dtype=dtype)
-        cases = [
-            (torch.randn(network.observation_steps, network.observation_dim, dtype=dtype), *values)
-            for state in (history, advance(history, chunk, torch.tensor([prior.chunk_length])))
-            for values in [[state[name] for name in HISTORY_ENTRIES]]
-        ]
+        later = advance(history, chunk, torch.tensor([prior.chunk_length]))
+        observation = torch.randn(network.observation_steps, network.observation_dim, dtype=dtype)
+        cases = [(observation, *(state[name] for name in HISTORY_ENTRIES)) for state in (history, later)]
         with _Draws() as noted:
-            data = dict(zip(HISTORY_ENTRIES, cases[0][1:], strict=True))
-            fixed(TensorDict({fixed.observation_key: cases[0][0], keys.HISTORY: TensorDict(data)}))
+            fixed(TensorDict({fixed.observation_key: observation, keys.HISTORY: history}))
         draws = [torch.randn(shape, dtype=kind) for shape, kind in noted.drawn]
         try:
             program = torch.export.export(decision, (*cases[0], *draws), strict=False)

@@ -1,4 +1,4 @@
-"""What sources share that learn from training windows by gradient descent (:meth:`Prior.fit`)."""
+"""The parts that sources share which learn from training windows by gradient descent (:meth:`Prior.fit`)."""
 
 from __future__ import annotations
 
