@@ -1,6 +1,6 @@
 """Print the model card of a policy with the results of a run, for python -m warmprior push --card README.md.
 
-python benchmarks/card.py runs/square-ph-quick runs/policies/square-ph-.../policy_010000 > README.md
+python benchmarks/card.py runs/can-ph-quick runs/policies/can-ph-.../policy_005000 > README.md
 """
 
 from __future__ import annotations

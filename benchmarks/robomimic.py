@@ -20,7 +20,7 @@ from lab.options import Options
 from lab.phases import Phases
 from lab.pictures import draw, films
 from lab.policies import policies_of
-from lab.presets import PRESETS
+from lab.presets import PRESETS, WHY_QUICK
 from lab.report import success_report, summary, terminal_table, unlike, write_report
 
 
@@ -47,6 +47,8 @@ def run(
         results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
         notes = [*unlike(options, presets["paper"]), f"Time before the pictures: {phases}."]
+        if options.data == PRESETS["quick"].data:
+            notes.insert(0, WHY_QUICK)
         full = success_report(results, top_k, notes, source)
         try:
             write_report(out, terminal_table(results, top_k), full, results, failures)

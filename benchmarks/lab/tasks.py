@@ -104,8 +104,8 @@ class DataOptions:
     """Options of the demonstrations that policies are trained on.
 
     Attributes:
-        task: tasks of robosuite (default: square, or the dataset's), or package.module:function of your own,
-            which takes these options and returns a Task
+        task: tasks of robosuite (default: can in the quick preset, otherwise square, or the dataset's), or
+            package.module:function of your own, which takes these options and returns a Task
         data: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
             source (human) or core (generated from source)
         dataset: demonstrations in place of generated ones: a robomimic HDF5 file, lerobot:FOLDER or

@@ -162,7 +162,7 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
     """A preset generates as many as it likes; a file is taken whole unless its user says otherwise."""
     file = tmp_path / "file.hdf5"
     file.touch()
-    counts = {"quick": (100, 100), "cpu": (150, 300), "paper": (200, 300), "much-ado": (200, 300)}
+    counts = {"quick": (25, 25), "cpu": (150, 300), "paper": (200, 300), "much-ado": (200, 300)}
     for name, (ph, mh) in counts.items():
         data = read("--preset", name).data
         assert (data.count("ph"), data.count("mh")) == (ph, mh)

@@ -72,9 +72,9 @@ def test_default_folders_are_numbered_past_the_latest(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for number in ("", "-2"):
         with started(read(), "robomimic") as out:
-            assert str(out) == f"runs/square-ph-quick{number}"
-    assert str(read().run.out) == "runs/square-ph-quick-3"
-    assert str(read("--resume").run.out) == "runs/square-ph-quick-2"
+            assert str(out) == f"runs/can-ph-quick{number}"
+    assert str(read().run.out) == "runs/can-ph-quick-3"
+    assert str(read("--resume").run.out) == "runs/can-ph-quick-2"
     assert str(read("--task", "can", "stack", "--preset", "cpu").run.out) == "runs/can-stack-ph-cpu"
 
 
