@@ -190,10 +190,12 @@ def _history(batch_size: Any, *values: Tensor) -> TensorDict:
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
     """Raise KeyError if a history is missing or incomplete, ValueError if its lengths differ."""
-    if history is None or any(history.get(name, None) is None for name in ENTRIES):
+    values = [None if history is None else history.get(name, None) for name in ENTRIES]
+    if any(value is None for value in values):
         writers = ". ActionHistory writes it in an environment, ActionWindow in a replay buffer"
         check_keys(TensorDict() if history is None else history, ENTRIES, f"the history of {whose}", writers)
-    lengths = history.get("actions").shape[-2], history.get("forecast").shape[-2]
+    actions, _, forecast, _ = values
+    lengths = actions.shape[-2], forecast.shape[-2]
     if lengths != (history_length, prediction_length):
         raise ValueError(
             f"{whose} needs {history_length} remembered actions and forecasts of {prediction_length}, but "

@@ -39,9 +39,9 @@ PRESETS["much-ado"] = with_parts(
 )
 
 WHY_QUICK = (
-    "Why can with 25 demonstrations: here the source matters. At one evaluation WP-Past has solved more than "
-    "the Gaussian source in each training so far (docs/notes/evidence.md). In most settings the difference is "
-    "smaller, and in some it is reversed (docs/which_source.md)."
+    "Why can with 25 demonstrations: here the source matters. At one evaluation WP-Past has solved more "
+    "than the Gaussian source in each training so far (docs/notes/evidence.md). In most settings the "
+    "difference is smaller, and in some it is reversed (docs/which_source.md)."
 )
 """What the report says of the setting of the quick preset."""
 
@@ -67,8 +67,8 @@ IMAGES: dict[str, dict[str, dict[str, Any]]] = {
 def adapted[O: Options](preset: O, typed: Options) -> O:
     """Return a preset for the demonstrations and observations that were asked for.
 
-    A file of demonstrations names its task. If ImageNet's weights cannot be downloaded, an encoder that the preset starts from them starts from random
-    weights.
+    A file of demonstrations names its task. If ImageNet's weights cannot be downloaded, an encoder that the
+    preset starts from them starts from random weights.
     """
     if typed.data.dataset is not None and all(map(is_simulated, preset.data.task)):
         preset = with_parts(preset, data={"task": ()})

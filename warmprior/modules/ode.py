@@ -299,10 +299,11 @@ class ODEActor(TensorDictModuleBase):
         self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk; ``sigma``, 1 by default, is the source's deviation, which guidance uses."""
-        check_keys(tensordict, self.in_keys[:2], "ODEActor")
-        if self.guidance is not None:
+        values: list[Any] = [tensordict.get(key, None) for key in self.in_keys]
+        if any(value is None for value in values):
+            check_keys(tensordict, self.in_keys[:2], "ODEActor")
             check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
-        a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)
+        a0, observation, *rest = values
         velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:
             leftover, left, delay = rest
