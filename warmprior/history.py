@@ -190,7 +190,7 @@ def _history(batch_size: Any, *values: Tensor) -> TensorDict:
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
     """Raise KeyError if a history is missing or incomplete, ValueError if its lengths differ."""
-    values = [None if history is None else history.get(name, None) for name in ENTRIES]
+    values: list[Any] = [None if history is None else history.get(name, None) for name in ENTRIES]
     if any(value is None for value in values):
         writers = ". ActionHistory writes it in an environment, ActionWindow in a replay buffer"
         check_keys(TensorDict() if history is None else history, ENTRIES, f"the history of {whose}", writers)
