@@ -1,0 +1,101 @@
+"""Thirty faults of one line, over all rooms: does the suite catch them?
+
+python tools/mutations.py              # all, in a copy of the last commit; some minutes
+python tools/mutations.py 3 7          # the third and the seventh
+
+A fault is a line of the library and what replaces it, with the test files that must fail. Files are found by
+the line, and tests by their names, so that rooms may move.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FAULTS = [  # (line, its replacement, names of test files)
+    ('(history["steps"] + executed).clamp(max=remembered)', "executed.clamp(max=remembered)", "history"),
+    ("line[..., low : low + remembered + length, :]", "line[..., : remembered + length, :]", "history"),
+    (
+        'warm = (history["steps"] >= self.chunk_length)',
+        'warm = (history["steps"] > self.chunk_length)',
+        "prior",
+    ),
+    ("& (position < self.chunk_length)", "& (position <= self.chunk_length)", "prior"),
+    ("math.sqrt(1.0 - self.correlation), math.sqrt(", "1.0 - self.correlation, math.sqrt(", "prior"),
+    ("time = begin + (step + sum(row)) * h", "time = begin + step * h", "ode"),
+    ("return 1 - t, t, -one, one", "return 1 - t, t, one, one", "ode flow_matching preconditioning"),
+    ("alpha * d_beta + d_alpha * beta, c)", "alpha * d_beta - d_alpha * beta, c)", "preconditioning"),
+    (
+        "torch.hypot(remainder, (best - slope) / scale)",
+        "remainder + (best - slope) / scale",
+        "preconditioning",
+    ),
+    ("total = weight.sum() * error.shape[-1]", "total = weight.sum()", "flow_matching"),
+    ("alpha=self.gamma**i)", "alpha=self.gamma)", "chunk"),
+    ("draw < self.probability", "draw > self.probability", "history window"),
+    ("full = steps >= actions.shape[-2]", "full = steps > 0", "history observations"),
+    ("torch.full_like(executed, self.delay)", "torch.full_like(executed, self.delay + 1)", "delay"),
+    ("recent = old.narrow(time, 1, self.steps - 1)", "recent = old.narrow(time, 0, self.steps - 1)", "stack"),
+    ("@ now[..., :3].mT", "@ now[..., :3]", "absolute_actions"),
+    ("noise = anchor + delta.to(anchor.dtype)", "noise = anchor - delta.to(anchor.dtype)", "decoder"),
+    ("torch.where(valid, mean, noise)", "torch.where(valid, mean, 0 * noise)", "anchor"),
+    ("value = value - alpha * log_prob", "value = value + alpha * log_prob", "dsrl"),
+    ("torch.where(constant, 1.0, half)", "half", "normalize"),
+    ("return sorted(outcomes, key=lambda outcome: outcome.seed)", "return outcomes", "evaluation"),
+    ('data.set("_step", active.to(home))', "pass", "evaluation"),
+    ("last_epoch=iteration - 1)", "last_epoch=-1)", "behaviour_cloning_states behaviour_cloning"),
+    ("if saved != value:", "if saved is None:", "behaviour_cloning_failures behaviour_cloning_states"),
+    ("return np.asarray(observations)[:-1]", "return np.asarray(observations)[1:]", "minari"),
+    ("block = dataset[first + start : first", "block = dataset[start : first", "hdf5 hdf5_faults robomimic"),
+    ("latency = 0 if self.latency is None or self._first", "latency = 0 if self.latency is None", "executor"),
+    ("executed = first + begins.int().argmax(1)", "executed = begins.int().argmax(1)", "memory"),
+    ("boundary = together & (decision", "boundary = (decision", "smoothness"),
+    ("variance(unbiased=True)[counted]", "variance(unbiased=False)[counted]", "source_leak"),
+]
+
+
+def sources(root: Path, line: str) -> list[Path]:
+    """Return the files of the library that hold a line."""
+    return [path for path in root.glob("warmprior/**/*.py") if line in path.read_text(encoding="utf-8")]
+
+
+def is_caught(root: Path, line: str, replacement: str, names: str) -> bool:
+    """Return True if a test fails with the fault; raise ValueError if the line is not there once."""
+    found = sources(root, line)
+    if len(found) != 1:
+        raise ValueError(f"{line!r} is in {len(found)} files: name a line that is in one")
+    before = found[0].read_text(encoding="utf-8")
+    tests = [str(path) for name in names.split() for path in root.glob(f"tests/**/test_{name}.py")]
+    if before.count(line) != 1 or not tests:
+        raise ValueError(f"{line!r} is {before.count(line)} times in {found[0]}; its tests are {tests}")
+    found[0].write_text(before.replace(line, replacement), encoding="utf-8")
+    try:
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+        places = [str(root / part) for part in ("", "benchmarks", "plugins/lerobot_policy_warmprior")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True)
+        return done.returncode == 1  # any other code is no failed test
+    finally:
+        found[0].write_text(before, encoding="utf-8")
+
+
+def main(chosen: list[str]) -> int:
+    """Try the faults; return 1 if one is not caught."""
+    numbers = [int(number) - 1 for number in chosen] or range(len(FAULTS))
+    missed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True)
+        subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
+        for number in numbers:
+            caught = is_caught(Path(folder), *FAULTS[number])
+            missed += not caught
+            print(f"{number + 1:2} {'caught' if caught else 'MISSED'}: {FAULTS[number][0]}", flush=True)
+    return min(missed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
