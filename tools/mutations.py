@@ -50,9 +50,9 @@ FAULTS = [  # (line, its replacement, names of test files)
     ("last_epoch=iteration - 1)", "last_epoch=-1)", "behaviour_cloning_states behaviour_cloning"),
     ("if saved != value:", "if saved is None:", "behaviour_cloning_failures behaviour_cloning_states"),
     ("return np.asarray(observations)[:-1]", "return np.asarray(observations)[1:]", "minari"),
-    ("rows].transpose(0, 3, 1, 2)", "rows].transpose(0, 3, 2, 1)", "hdf5 robomimic"),
+    ("rows].transpose(0, 3, 1, 2)", "rows].transpose(0, 3, 2, 1)", "observe convert"),
     ("self._executed >= min(self.execute, self._end)", "self._executed >= self._end", "executor"),
-    ("executed = first + begins.int().argmax(1)", "executed = begins.int().argmax(1)", "memory"),
+    ("executed = first + begins.int().argmax(1)", "executed = begins.int().argmax(1)", "rollout"),
     ("boundary = together & (decision", "boundary = (decision", "smoothness"),
     ("variance(unbiased=True)[counted]", "variance(unbiased=False)[counted]", "source_leak"),
 ]
