@@ -210,9 +210,11 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
 class Failing(Scripted):
     def __init__(self, length, fails):
         super().__init__(length)
-        self.fails, self.decisions = fails, 0
+        self.fails, self.decisions, self.interruption = fails, 0, None
 
     def forward(self, data):
+        if self.interruption is not None:
+            raise self.interruption
         self.decisions += 1
         if self.decisions - 1 in self.fails:
             raise ZeroDivisionError("the camera fell off")
@@ -252,6 +254,24 @@ def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
             with contextlib.suppress(ZeroDivisionError):
                 assert executor.act(torch.tensor([9.0]))[0] == 9.0
                 return
+
+
+@pytest.mark.parametrize("interruption", [SystemExit, KeyboardInterrupt])
+def test_an_interruption_in_the_thread_is_raised_once(interruption):
+    """Also while actions are left; afterwards the robot goes on."""
+    policy, executor = failing((), None)
+    with executor:
+        for tick in range(4):
+            executor.act(torch.tensor([float(tick)]))
+        policy.interruption = interruption
+        raised = 0
+        for tick in range(4, 30):
+            try:
+                executor.act(torch.tensor([float(tick)]))
+            except interruption:
+                raised += 1
+                policy.interruption = None
+        assert raised == 1
 
 
 def test_a_reset_forgets_what_is_under_way():

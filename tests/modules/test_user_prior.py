@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.toy_env import Learned, demonstrations, mlp_actor
+from tests.toy_env import Learned, demonstrations, mlp_actor, random_history
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder
 from warmprior.modules.option_text import find, make, options_of
 from warmprior.modules.registry import from_config
@@ -154,3 +154,22 @@ def test_options_behind_a_name():
     assert options_of(text) == {"gain": 0.5, "offsets": [1.0, 2.0], "correlation": 0.25}
     prior = make(Prior, text, H)
     assert prior.config()["offsets"] == [1.0, 2.0] and prior.correlation == 0.25
+
+
+class Careless(PastPrior):
+    """A source whose mean is written into the history that it reads."""
+
+    name = "careless-of-the-tests"
+
+    def mean(self, history):
+        history["actions"] += 1.0
+        history["steps"] = torch.full_like(history["steps"], self.chunk_length)
+        return super().mean(history)
+
+
+def test_a_mean_that_writes_into_what_it_reads_changes_no_history():
+    history = random_history(PastPrior(H), 5)
+    before = history.clone()
+    loc = Careless(H).distribution(history).loc
+    assert (history == before).all()
+    assert torch.equal(loc, before["actions"] + 1.0)

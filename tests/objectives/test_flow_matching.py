@@ -14,9 +14,11 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     LinearInterpolant,
+    Normalizer,
     PastPrior,
     PreviewPrior,
     Source,
+    keys,
     window_replay_buffer,
 )
 from warmprior.history import history_keys
@@ -290,3 +292,20 @@ def test_weights_and_masks_of_torchrl(reduction, trailing):
     torch.testing.assert_close(plain, error)
     batch["collector", "mask"] = torch.zeros(3, 4, dtype=torch.bool)
     assert not loss("mean")  # nothing counts: 0, and not NaN
+
+
+def test_windows_in_raw_units_are_refused_where_the_policy_has_a_normaliser():
+    """Also where a target is missing; normalised windows may reach a little past the range."""
+    raw = dataset()
+    raw["action"] = 500 * raw["action"]
+    normalizer = Normalizer.fit(raw)
+    loss = FlowMatchingLoss(actor_for(PastPrior(H), action_dim=D_A, normalizer=normalizer))
+    windows = {
+        name: window_replay_buffer(data, PastPrior(H), batch_size=25)[:]
+        for name, data in (("raw", raw), ("normalised", normalizer.normalize(raw)))
+    }
+    with raises(ValueError, "normalize(data)", "[-1, 1]"):
+        loss(windows["raw"])
+    again = FlowMatchingLoss(loss.actor_network)
+    windows["normalised"][keys.CHUNK] *= 1.5
+    assert float(again(windows["normalised"])["loss_flow_matching"]) < 100

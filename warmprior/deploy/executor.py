@@ -273,9 +273,10 @@ class AsyncExecutor:
             return
         try:
             chunk = self._pending.result()
-        except Exception as error:
+        except BaseException as error:
             self._pending, self._failed = None, True
-            if not self._left:
+            # An interruption, such as SystemExit, is raised at once, and once.
+            if not (isinstance(error, Exception) and self._left):
                 raise
             warnings.warn(
                 f"a decision failed ({error!r}): executing the {self._left} actions that are left, and "

@@ -35,6 +35,10 @@ Objective = Literal["velocity", "l1"]
 Weighting = Literal["velocity", "standardised"]
 
 
+FAR_OUTSIDE = 10.0
+"""A size that no normalised action has; those of other demonstrations reach a little past 1."""
+
+
 class FlowMatchingLoss(Drawing, LossModule):
     r"""The conditional flow-matching loss with the actor's own source (Algorithm 1, training).
 
@@ -79,7 +83,8 @@ class FlowMatchingLoss(Drawing, LossModule):
         where the generator must be too.
 
     Raises:
-        ValueError: if an option is unknown, or does not fit another option, the network or the policy.
+        ValueError: if an option is unknown, or does not fit another option, the network or the policy; when
+            called, if targets are in raw units although the policy has a normaliser.
 
     See Also:
         :class:`~warmprior.training.BehaviourCloning`: the training loop around this loss.
@@ -162,6 +167,7 @@ class FlowMatchingLoss(Drawing, LossModule):
                 f"{type(self.interpolant).__name__}"
             )
         self.generator = actor_network.sampler.chosen_generator(generator)
+        self._looked_at = False
         self.set_keys(observation=actor_network.observation_key)
 
     def _set_in_keys(self) -> None:
@@ -178,6 +184,8 @@ class FlowMatchingLoss(Drawing, LossModule):
         device = device_of(actor.network, tensordict.get(k.chunk))
         a1, history, observation = (_moved(tensordict.get(key), device) for key in needed)
         check_positions(k.chunk, a1, actor.prior)
+        if not self._looked_at:
+            self._check_normalised(a1)
         a1 = a1 if a1.is_floating_point() else a1.to(torch.get_default_dtype())
         weight, masked = self._weight(tensordict, a1)
         if weight is not None:
@@ -195,6 +203,16 @@ class FlowMatchingLoss(Drawing, LossModule):
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:])).reshape(a1.shape)
         loss = self._reduced(self._error(predicted, velocity, t), weight)
         return TensorDict({self.out_keys[0]: loss}, batch_size=[])
+
+    def _check_normalised(self, a1: Tensor) -> None:
+        """Raise ValueError if the first batch is in raw units, but the policy has a normaliser."""
+        self._looked_at = True
+        largest = float(a1.nan_to_num(0.0, 0.0, 0.0).abs().max()) if a1.numel() else 0.0
+        if self.actor_network.normalizer is not None and largest > FAR_OUTSIDE:
+            raise ValueError(
+                f"the targets {self.tensor_keys.chunk!r} reach {largest:.4g}, but the policy's normaliser "
+                "maps actions to [-1, 1]: make the windows from policy.normalizer.normalize(data)"
+            )
 
     def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> tuple[Tensor | None, bool]:
         """Return the positions' weights ``[*B, P]``, ``None`` if all are equal, and if windows are masked."""
