@@ -24,7 +24,7 @@ from warmprior.envs.navigation1d import (
     navigation_positions,
 )
 
-ABOVE, BELOW, INK = "#1f77b4", "#d95f02", "#202020"  # sides of the toy's obstacles, and a highlighted path
+ABOVE, BELOW, INK = "#6e6e6e", "#bdbdbd", "#101010"  # sides of the toy's obstacles, and a highlighted path
 PALEST = 0.6  # share of white (or black, for bright colours) in a method's last shade
 RATES = ("success", "success_rate")
 
@@ -239,7 +239,7 @@ def plot_filmstrip(frames: Sequence[np.ndarray], labels: Sequence[str], path: st
 
 
 def sides(axis: Any, x: np.ndarray, lines: np.ndarray, decides: int, **look: Any) -> None:
-    """Draw lines in the colour of the side of their point with index `decides`."""
+    """Draw lines in the grey of the side of their point with index `decides`."""
     for line in lines:
         axis.plot(x, line, color=ABOVE if line[decides] > 0 else BELOW, **look)
 
@@ -252,8 +252,8 @@ def plot_navigation(
 ) -> None:
     """Draw executed paths between the obstacles, in a panel for the data and one per policy (Fig. 5).
 
-    `panels` has heights [n, 64] and lines of text by title. A path is coloured by the side of its first
-    action; one path is black, with a dot at the first action of each chunk.
+    `panels` has heights [n, 64] and lines of text by title. A path is dark or light by the side of its
+    first action; one path is black, with a dot at the first action of each chunk.
     """
     rows = -(-(len(panels) + 1) // 3)
     figure, axes = new_figure(11.0, 0.7 + 3.0 * rows, rows, 3, share=True)
@@ -272,8 +272,8 @@ def plot_navigation(
             heights, lines = panels[name]
             drawn = heights[:24].numpy()
             sides(axis, x, drawn, 0, lw=0.8, alpha=0.45)
-            axis.plot(x, drawn[0], color=INK, lw=1.3)
-            axis.plot(x[::chunk_length], drawn[0, ::chunk_length], "o", color=INK, ms=2.8)
+            axis.plot(x, drawn[0], color=INK, lw=1.6)
+            axis.plot(x[::chunk_length], drawn[0, ::chunk_length], "o", color=INK, ms=3.4)
         letter = f"({ascii_lowercase[i]}) " if i < len(ascii_lowercase) else ""
         below = i >= len(panels) + 1 - 3
         dress(

@@ -1,6 +1,5 @@
 """Draw and write the leaderboard: success of methods on human and on scripted demonstrations, by NFE.
 
-The README's table has its means next to those on scripted demonstrations.
 
 PYTHONPATH=benchmarks python docs/figures/leaderboard.py    # or: make results; writes a picture and a table
 
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pages import own_best, write
 from pandas import DataFrame, concat
-from results import CHOICES, GROUPS, TWENTY_FIVE, WARM, all_lengths, paper_table
+from results import CHOICES, GROUPS, TWENTY_FIVE, all_lengths, paper_table
 from scipy.stats import rankdata
 from scipy.stats import t as student_t
 from shared import (
@@ -28,12 +27,10 @@ from shared import (
     SOURCES,
     WIDTH,
     Comparison,
-    at_nine_three_one,
     beside,
     compare,
     figure,
     finish,
-    read_cells,
     read_played,
     save,
     shown_sources,
@@ -43,7 +40,7 @@ from shared import (
 from lab.paper import PAPER_SUCCESS
 from lab.statistics import interval, spread_of
 
-PAGE, README = DOCS / "leaderboard.md", DOCS.parent / "README.md"
+PAGE = DOCS / "leaderboard.md"
 DOOR = "door, 25"
 PUSHT = "pusht"
 DRAWS = 2_000  # of the means, for the intervals of ranks
@@ -186,16 +183,9 @@ def one_seed_table() -> str:
     return "\n".join(text) + "\n"
 
 
-def readme_table() -> str:
-    """Return success of four sources on human and scripted demonstrations in Markdown, at NFE 9 / 3 / 1."""
-    sources = (GAUSSIAN, *WARM)
-    people = standings().assign(success=lambda frame: frame["mean"])
-    groups = {"human": people} | {f"scripted, {name}": read_cells(runs) for name, runs in GROUPS.items()}
-    text = [f"| demonstrations | {' | '.join(SOURCES[source][0] for source in sources)} |"]
-    text.append("|---" * (1 + len(sources)) + "|")
-    for name, rows in groups.items():
-        text.append(f"| {name} | {' | '.join(at_nine_three_one(rows, source) for source in sources)} |")
-    return "\n".join(text) + "\n"
+def paper_gain(source: str, nfe: int) -> float:
+    """Return how many points a source is ahead in the paper, on the mean of its thirteen cells."""
+    return float(np.mean([cell[source][nfe] - cell[GAUSSIAN][nfe] for cell in PAPER_SUCCESS.values()]))
 
 
 def effect_table() -> str:
@@ -205,9 +195,9 @@ def effect_table() -> str:
     for source in (PAST, PREVIEW):
         longer = all_lengths(source, CHOICES["long training"])
         for nfe, long in zip((9, 3, 1), longer, strict=True):
-            paper = np.mean([cell[source][nfe] - cell[GAUSSIAN][nfe] for cell in PAPER_SUCCESS.values()])
             human = beside_source(source, nfe)
-            text.append(f"| {SOURCES[source][0]} | {nfe} | {paper:+.1f} | {human.points} | {long.points} |")
+            paper = f"{paper_gain(source, nfe):+.1f}"
+            text.append(f"| {SOURCES[source][0]} | {nfe} | {paper} | {human.points} | {long.points} |")
     return "\n".join(text) + "\n"
 
 
@@ -215,7 +205,6 @@ def tables() -> dict[Path, list[str]]:
     """Return the tables of each page."""
     return {
         PAGE: [table(HUMAN), one_seed_table(), table(SCRIPTED)],
-        README: [readme_table()],
         DOCS / "paper.md": [effect_table(), paper_table()],
     }
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import torch
 from navigation1d import NAVIGATION_PRESETS
-from shared import DOCS, INK, WIDTH
+from shared import DOCS, GAUSSIAN, INK, PAST, PREVIEW, SOURCES
 
 from lab.navigation import play_navigation
-from lab.plots import new_figure
+from lab.plots import ABOVE, BELOW, new_figure
 from lab.tasks import navigation_task
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
@@ -24,12 +24,7 @@ from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navi
 from warmprior.training import train_policy
 
 OUT = DOCS / "_static" / "what_changes.png"
-ABOVE, BELOW, ONE = "#1f77b4", "#d95f02", "#1b9e77"
-SOURCES = {
-    "Gaussian source": GaussianPrior(16),
-    "WP-Past: what was just executed": PastPrior(16),
-    "WP-Preview: its own earlier forecast": PreviewPrior(16),
-}
+PRIORS = {GAUSSIAN: GaussianPrior(16), PAST: PastPrior(16), PREVIEW: PreviewPrior(16)}
 AHEAD = 4
 """Position of the chunk that is shown."""
 
@@ -38,13 +33,13 @@ def main() -> None:
     """Train the policies, and draw."""
     options, task = NAVIGATION_PRESETS["quick"], navigation_task()
     data = SharedObservations(task.data, 16)
-    figure, axes = new_figure(WIDTH, 7.8, 3, 2)
-    flows, paths = axes[::2], axes[1::2]
+    figure, axes = new_figure(8.4, 4.6, 2, 3)
+    flows, paths = axes[:3], axes[3:]
     with tempfile.TemporaryDirectory() as folder:
-        for row, (name, prior) in enumerate(SOURCES.items()):
+        for column, (name, prior) in enumerate(PRIORS.items()):
             place = Path(folder) / prior.name
             # The Gaussian source reads no history, so none is withheld.
-            withheld = options.training.cold_probability if row else 0.0
+            withheld = options.training.cold_probability if column else 0.0
             training = replace(options.training, cold_probability=withheld)
             actor = train_policy(task, prior, place, network=options.network, training=training)
             window = data.windows(actor.prior)
@@ -53,7 +48,7 @@ def main() -> None:
             batch = window[index : index + 1].expand(160).contiguous()
             generator = torch.Generator().manual_seed(0)
             lines = flow_paths(actor, batch, 50, generator=generator)[..., AHEAD, 0]
-            axis, t = flows[row], torch.linspace(0, 1, lines.shape[-1])
+            axis, t = flows[column], torch.linspace(0, 1, lines.shape[-1])
             for line in lines[:48]:
                 axis.plot(t, line, color=ABOVE if line[-1] > 0 else BELOW, lw=0.6, alpha=0.6)
             axis.hist(
@@ -64,22 +59,23 @@ def main() -> None:
                 bottom=-0.02,
                 weights=torch.full((len(lines),), -0.006).tolist(),
             )
-            axis.set(xlim=(-0.22, 1.02), ylim=(-2.6, 2.6), ylabel="one action of the chunk")
-            axis.set_title(name, fontweight="bold", loc="left")
+            label, color, _ = SOURCES[name]
+            axis.set(xlim=(-0.22, 1.02), ylim=(-2.6, 2.6))
+            axis.set_title(label, fontweight="bold", loc="left", color=color)
             axis.set_xticks([0, 1], ["source", "action"])
             rollout = play_navigation(actor, 0, nfe=9, rollouts=64)
             heights = executed_actions(rollout)[0].squeeze(-1)
-            axis, x = paths[row], navigation_positions()
+            axis, x = paths[column], navigation_positions()
             for c in OBSTACLES:
                 axis.fill_between(
                     [c - HALF_WIDTH, c + HALF_WIDTH], -HALF_HEIGHT, HALF_HEIGHT, color=INK, alpha=0.35
                 )
             for line in heights[:24]:
                 axis.plot(x, line, color=ABOVE if line[0] > 0 else BELOW, lw=0.6, alpha=0.6)
-            axis.plot(x, heights[0], color=ONE, lw=1.8, marker="o", ms=3.5, markevery=16)
-            axis.set(ylabel="height of the robot", ylim=(-1.5, 1.5))
-    flows[-1].set_xlabel("time of the flow")
-    paths[-1].set_xlabel("position along the way")
+            axis.plot(x, heights[0], color=color, lw=2.2, marker="o", ms=4, markevery=16)
+            axis.set(xlabel="position along the way", ylim=(-1.5, 1.5))
+    flows[0].set_ylabel("one action of the chunk")
+    paths[0].set_ylabel("height of the robot")
     figure.savefig(OUT, dpi=150)
     print(f"written to {OUT}")
 
