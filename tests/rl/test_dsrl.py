@@ -161,6 +161,8 @@ def test_decisions_that_multistep_joins_are_refused(discount):
     with raises(ValueError, "MultiStep"):
         build(discount=discount)(joined)
     build(discount=discount)(joined.set("steps_to_next_obs", torch.ones(N, 1)))
+    # TorchRL's own losses need a copy of the executed steps under this name, in the same buffer.
+    build(discount=discount)(joined.set("steps_to_next_obs", joined["next", "executed_steps"].clone()))
 
 
 @pytest.mark.parametrize("prior", [GaussianPrior(H), PastPrior(H), PastPrior(H, sigma=0.0)])

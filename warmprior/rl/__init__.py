@@ -4,10 +4,12 @@ from warmprior.rl.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor, has_anchor
 from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
+from warmprior.rl.improved import AgentStart, improved_policy
 from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.training import PriorSpaceTraining
 
 __all__ = [
+    "AgentStart",
     "BoxTanhNormal",
     "DSRLNALoss",
     "PriorAnchor",
@@ -17,6 +19,7 @@ __all__ = [
     "PriorSpaceTraining",
     "ResidualSampler",
     "has_anchor",
+    "improved_policy",
     "make_prior_space_actor",
     "make_prior_space_critic",
 ]

@@ -245,12 +245,7 @@ class DSRLNALoss(LossModule):
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses of actor, temperature and action critic on transitions; write the TD errors."""
         check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
-        steps = tensordict.get(STEPS, None)
-        if steps is not None and bool((steps > 1).any()):
-            raise ValueError(
-                f"{STEPS!r} says that next states are several decisions later, but nothing says how many "
-                "control steps, nor whether an episode has ended there: leave MultiStep out"
-            )
+        self._check_next_states(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()
         loss_qvalue, td_error = self._qvalue_loss(tensordict, alpha)
@@ -267,6 +262,18 @@ class DSRLNALoss(LossModule):
         result = self._finish(losses, tensordict, weights).set("alpha", alpha)
         diagnostics = {"entropy": -log_prob.detach(), "td_error": td_error}
         return result.update(self._finish(diagnostics, tensordict, None))
+
+    def _check_next_states(self, tensordict: TensorDictBase) -> None:
+        """Raise ValueError if next states are several decisions later (``MultiStep``)."""
+        steps = tensordict.get(STEPS, None)
+        executed = tensordict.get(unravel_key(("next", self.tensor_keys.executed)), None)
+        # A copy of the executed steps, which TorchRL's own losses need, says what this loss knows.
+        copied = steps is not None and executed is not None and bool((steps == executed).all())
+        if steps is not None and not copied and bool((steps > 1).any()):
+            raise ValueError(
+                f"{STEPS!r} says that next states are several decisions later, but nothing says how many "
+                "control steps, nor whether an episode has ended there: leave MultiStep out"
+            )
 
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():

@@ -159,7 +159,7 @@ def make_prior_space_actor(
         in_keys, chunk, (observation_steps, observation_dim), 2 * math.prod(chunk), hidden_dim, num_layers, {}
     )
     parameters = ["delta_loc", "delta_scale"]
-    return ProbabilisticActor(
+    actor = ProbabilisticActor(
         TensorDictModule(_ActorHead(trunk, chunk), in_keys=list(in_keys), out_keys=parameters),
         in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
         out_keys=[keys.DELTA],
@@ -169,6 +169,18 @@ def make_prior_space_actor(
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
         return_log_prob=True,
     )
+    # For improved_policy, which builds it again.
+    actor.options = {
+        "action_dim": action_dim,
+        "observation_dim": observation_dim,
+        "prediction_length": prediction_length,
+        "observation_steps": observation_steps,
+        "delta": delta,
+        "hidden_dim": hidden_dim,
+        "num_layers": num_layers,
+        "in_keys": list(in_keys),
+    }
+    return actor
 
 
 def make_prior_space_critic(
