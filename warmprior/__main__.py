@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +25,13 @@ from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
 from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, model_card, train_policy
 from warmprior.training.behaviour_cloning import policy_path
-from warmprior.training.saved import check_repository, policy_config, policy_file, push_policy
+from warmprior.training.saved import (
+    check_repository,
+    policy_config,
+    policy_file,
+    push_policy,
+    save_policy,
+)
 from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.window import window_transforms
 
@@ -186,6 +192,66 @@ def evaluate(
             **options,
         )
         print(f"{video}: episode {first_seed}, {'' if filmed.success else 'not '}solved")
+
+
+def improve(
+    folder: Policy,
+    /,
+    *,
+    steps: int = 100_000,
+    algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na",
+    delta: float | None = None,
+    nfe: int | None = None,
+    num_envs: int = 4,
+    episodes: int = 100,
+    seed: int = 0,
+    out: Path = Path("improved"),
+    revision: str | None = None,
+    modules: Imported = (),
+) -> None:
+    """Improve a saved policy by reinforcement learning in its source space; it must solve some episodes.
+
+    Args:
+        folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
+            Hugging Face hub
+        steps: control steps to learn from
+        algorithm: algorithm of the agent
+        delta: half the side of the agent's box; by default 0.5 around a warm mean, and 1.5 around zero
+        nfe: network evaluations per chunk; by default the policy's
+        num_envs: simulators in worker processes
+        episodes: episodes that compare the policies before and after
+        seed: seed of all random draws
+        out: folder of trainings, in which an interrupted one continues
+        revision: branch, tag or commit of the repository; by default main
+        modules: module that defines your own prior, start point or network; may be repeated
+    """
+    from warmprior.rl.improve import SMALL, improve_policy
+
+    actor = _policy(folder, revision, modules)
+    warmup = min(SMALL.warmup_steps, steps)
+    config = replace(
+        SMALL,
+        algorithm=algorithm,
+        environment_steps=steps,
+        warmup_steps=warmup,
+        evaluate_every=max(1, steps // 10),
+        nfe=actor.sampling.evaluations(nfe),
+        delta=delta,
+        seed=seed,
+    )
+    print(
+        f"{algorithm} around a box of +-{config.box(actor):g}: {steps:,} control steps, the first "
+        f"{warmup:,} without an agent; {config.updates} updates per step of {num_envs} simulators, discount "
+        f"{config.gamma:g} per chunk, NFE {config.nfe}",
+        flush=True,
+    )
+    place = out / f"{Path(folder).parent.name}-{Path(folder).name}-{algorithm}-seed{seed}"
+    result = improve_policy(actor, place, num_envs=num_envs, config=config, episodes=episodes)
+    save_policy(result.policy, place / "policy")
+    words = "no agent was better, so the policy is as it was"
+    if result.policy.start is not None:
+        words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
+    print(f"{words}\nto play it: python -m warmprior evaluate {place / 'policy'}")
 
 
 @dataclass(frozen=True)
@@ -373,7 +439,7 @@ def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> N
     print(observe_recordings(file, out, demos=demonstrations))
 
 
-COMMANDS = (info, push, evaluate, train, export, convert, observe)
+COMMANDS = (info, push, evaluate, train, improve, export, convert, observe)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from warmprior.rl.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor, has_anchor
 from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
+from warmprior.rl.improve import Improvement, improve_policy
 from warmprior.rl.improved import AgentStart, improved_policy
 from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.training import PriorSpaceTraining
@@ -12,6 +13,7 @@ __all__ = [
     "AgentStart",
     "BoxTanhNormal",
     "DSRLNALoss",
+    "Improvement",
     "PriorAnchor",
     "PriorDecoder",
     "PriorSpace",
@@ -19,6 +21,7 @@ __all__ = [
     "PriorSpaceTraining",
     "ResidualSampler",
     "has_anchor",
+    "improve_policy",
     "improved_policy",
     "make_prior_space_actor",
     "make_prior_space_critic",

@@ -158,9 +158,9 @@ class PriorSpaceAgent:
             )
         sizes |= {"hidden_dim": config.hidden_dim, "num_layers": config.num_layers}
         network = make_prior_space_actor(**sizes, delta=self.decoder.delta, in_keys=self.state_keys)
-        network = network.to(self.device)
-        self.policy = TensorDictSequential(network, self.decoder)
-        self.loss = self._make_loss(network, sizes).to(self.device)
+        self.network = network.to(self.device)
+        self.policy = TensorDictSequential(self.network, self.decoder)
+        self.loss = self._make_loss(self.network, sizes).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self._updater = SoftUpdate(self.loss, tau=config.tau)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)

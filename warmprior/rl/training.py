@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -24,7 +25,16 @@ from warmprior.io.progress import progress_bar
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
-from warmprior.training.checkpoint import RunState, as_key, digest_of_state, load_state, save_state
+from warmprior.rl.improved import improved_policy
+from warmprior.training.checkpoint import (
+    RunState,
+    as_key,
+    digest_of_state,
+    load_state,
+    named,
+    save_state,
+    select,
+)
 from warmprior.training.evaluation import evaluate
 from warmprior.training.parallel import transforms_of, watched
 from warmprior.transforms.chunk import ChunkStep
@@ -147,6 +157,7 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
+        self._best: dict[str, torch.Tensor] = {}
         self.identity = {
             "config": asdict(config),
             "prior": actor.prior.config(),
@@ -321,11 +332,25 @@ class PriorSpaceTraining:
                 "successes": successes,
                 "success_rate": successes / len(episodes),
             }
+            rates = [r["success_rate"] for r in self.curve if r["evaluation"] != "stochastic"]
+            if name == "greedy" and successes / len(episodes) > max(rates):
+                self._best = {n: v.detach().clone() for n, v in self.agent.network.state_dict().items()}
             self.curve.append(row)
         self.agent.policy.train()
 
+    def policy(self) -> WarmPriorActor:
+        """Return the best policy of the evaluations so far, with a greedy agent.
+
+        It is the frozen policy, at the agent's number of network evaluations, if no agent was better.
+        """
+        if not self._best:
+            return self.actor.replace(nfe=self.config.nfe)
+        agent = copy.deepcopy(self.agent.network)
+        agent.load_state_dict(self._best)
+        return improved_policy(self.actor, agent, nfe=self.config.nfe)
+
     def _save(self) -> None:
-        tensors = {**self.agent.state(), "rng": torch.get_rng_state()}
+        tensors = {**self.agent.state(), **named("best", self._best), "rng": torch.get_rng_state()}
         if self.device.type == "cuda":
             tensors["rng_cuda"] = torch.cuda.get_rng_state(self.device)
         self.segments.write()
@@ -343,6 +368,7 @@ class PriorSpaceTraining:
         if transitions is not None:
             self.buffer.extend(transitions)
         self.agent.load(tensors)
+        self._best = {name: value.to(self.device) for name, value in select("best", tensors).items()}
         self.steps, self.curve = facts["steps"], facts["curve"]
         torch.set_rng_state(tensors["rng"])
         if "rng_cuda" in tensors:

@@ -1,0 +1,83 @@
+"""A saved policy is improved, the better policy is kept, and nothing is lost at an interruption."""
+
+from functools import partial
+
+import pytest
+
+from tests.errors import raises
+from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
+from tests.states import same
+from warmprior import GaussianPrior, PastPrior, policy_transforms
+from warmprior.rl import improve_policy, improved_policy
+from warmprior.training import evaluate, load_policy, parallel_env, save_policy
+
+
+class ReachEnv(SolvableEnv):
+    """A success where the actions of an episode sum to more than 1; a policy that stays at 0 has none."""
+
+    def _seen(self, out):
+        reached = out["observation"][..., 2:3] > 0.5
+        return out.set("success", reached)
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        out["reward"] = out["success"].float()
+        return out
+
+
+def make_env(seed_offset, seed_stride):
+    return ReachEnv(6)
+
+
+@pytest.mark.parametrize("prior", [PastPrior(H), GaussianPrior(H)])
+def test_the_best_agent_of_the_evaluations_is_the_policy(tmp_path, prior):
+    """By hand: the evaluation with the most successes, if it has more than the frozen policy."""
+    actor = make_actor(prior)
+    training = make_training(tmp_path, actor=actor)
+    kept, evaluated = {}, training._evaluate
+
+    def remembering(env, policies):
+        evaluated(env, policies)
+        weights = {n: v.clone() for n, v in training.agent.network.state_dict().items()}
+        kept[training.steps] = weights
+
+    training._evaluate = remembering
+    curve = training.run()
+    rates = {row["environment_steps"]: row["success_rate"] for row in curve if row["evaluation"] == "greedy"}
+    base = curve[0]["success_rate"]
+    policy = training.policy()
+    best = max(rates, key=lambda steps: (rates[steps], -steps))
+    if rates[best] > base:
+        agent = training.agent.network
+        agent.load_state_dict(kept[best])
+        expected = improved_policy(actor, agent, nfe=2)
+        assert same(policy.state_dict(), expected.state_dict())
+    else:
+        assert policy.start is None and policy.sampling.nfe == 2
+    again = make_training(tmp_path, actor=actor).policy()  # from the folder
+    assert same(policy.state_dict(), again.state_dict())
+
+
+def test_a_policy_is_improved_compared_and_saved(tmp_path):
+    actor = make_actor()
+    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
+    options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
+    config = make_config(environment_steps=60)
+    result = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
+    assert [row["evaluation"] for row in result.curve[:3]] == ["base", "greedy", "stochastic"]
+    save_policy(result.policy, tmp_path / "policy")
+    env = parallel_env(make_env, transforms, 2)
+    for policy, solved in ((actor, result.before), (load_policy(tmp_path / "policy"), result.after)):
+        played = evaluate(policy, env, episodes=4, first_seed=10_005_000, nfe=2)
+        assert sum(episode.success for episode in played) == solved
+    env.close()
+    again = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
+    assert again.curve == result.curve and (again.before, again.after) == (result.before, result.after)
+
+
+def test_a_policy_without_an_environment_is_refused(tmp_path):
+    with raises(ValueError, "keeps no description"):
+        improve_policy(make_actor(), tmp_path)
+    with raises(ValueError, "make_transforms"):
+        improve_policy(make_actor(), tmp_path, make_env=make_env)
+    assert not list(tmp_path.iterdir())

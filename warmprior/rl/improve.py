@@ -1,0 +1,151 @@
+"""Improvement of a saved policy by reinforcement learning in its source space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from warmprior.checks import check_whole_numbers
+from warmprior.envs.description import environment_parts
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.workers import torch_threads
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.rl.agent import PriorSpaceConfig
+from warmprior.rl.anchor import PriorAnchor
+from warmprior.rl.training import PriorSpaceTraining
+from warmprior.training.evaluation import evaluate
+from warmprior.training.parallel import parallel_env
+
+SMALL = PriorSpaceConfig(
+    environment_steps=100_000,
+    warmup_steps=4_000,
+    updates=4,
+    noise_critic_steps=2,
+    hidden_dim=256,
+    gamma=0.98,
+    # At 1, the entropy of a chunk would be worth more than a success until the temperature has fallen.
+    alpha_init=0.05,
+    evaluate_every=10_000,
+    evaluation_episodes=50,
+)
+"""A recipe for two cores and simulated manipulation, whose episodes have some fifty decisions."""
+
+REPORTED = 5_000
+"""The distance of the reported episodes' seeds from those by which the policy is chosen."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The result of :func:`improve_policy`.
+
+    Attributes:
+        policy: the improved policy, or the frozen one if no agent was better.
+        before: solved episodes of the frozen policy.
+        after: solved episodes of ``policy``.
+        episodes: number of episodes of each, from the same starts, by which nothing was chosen.
+        curve: the evaluations by which the policy was chosen, see :meth:`PriorSpaceTraining.run`.
+    """
+
+    policy: WarmPriorActor
+    before: int
+    after: int
+    episodes: int
+    curve: list[dict[str, Any]]
+
+
+def improve_policy(
+    policy: WarmPriorActor,
+    directory: str | Path,
+    *,
+    make_env: Callable[..., EnvBase] | None = None,
+    make_transforms: Callable[[], Compose] | None = None,
+    num_envs: int = 4,
+    config: PriorSpaceConfig | None = None,
+    episodes: int = 100,
+    description: str | None = "improve",
+) -> Improvement:
+    """Improve a policy by reinforcement learning in its source space.
+
+    The policy stays frozen, and an agent learns where its flow starts (:class:`PriorSpaceTraining`). The
+    environment's reward is that of the task: 1 where a control step solves it, else 0. The best agent of the
+    evaluations is kept, or the frozen policy if none was better; both then play other episodes.
+
+    Args:
+        policy: the policy, such as one of :func:`~warmprior.training.load_policy`. It must solve some
+            episodes: where it solves none, there is no reward to learn from.
+        directory: folder of the training, which continues where it was interrupted.
+
+    Keyword Args:
+        make_env: builds the environment, called as for :func:`~warmprior.training.parallel_env`; by default
+            the environment that the policy was made for.
+        make_transforms: builds the policy's transforms for ``make_env``.
+        num_envs: environments in worker processes.
+        config: the recipe; by default :data:`~warmprior.rl.improve.SMALL`, at the policy's own number of
+            network evaluations.
+        episodes: episodes of the final comparison.
+        description: label of the progress bars; none if ``None``.
+
+    Raises:
+        ValueError: if the policy keeps no description of an environment and ``make_env`` is missing, or the
+            recipe does not fit the policy.
+        FloatingPointError: if the training diverges; the last save stays.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from functools import partial
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
+        >>> from warmprior.rl import PriorSpaceConfig, improve_policy
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
+        >>> config = PriorSpaceConfig(
+        ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
+        ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
+        >>> def make_env(seed_offset, seed_stride):
+        ...     return NavigationEnv((1, 1))
+        >>> transforms = partial(policy_transforms, actor)
+        >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
+        ...     result = improve_policy(actor, folder, make_env=make_env, make_transforms=transforms,
+        ...                             num_envs=2, config=config, episodes=4)
+        >>> result.before, result.after  # doctest: +SKIP
+        (0, 0)
+    """
+    check_whole_numbers(num_envs=num_envs, episodes=episodes)
+    if make_env is None:
+        make_env, make_transforms = environment_parts(policy)
+    elif make_transforms is None:
+        raise ValueError("make_env needs make_transforms, such as partial(policy_transforms, policy)")
+    builders = make_env, make_transforms
+    config = replace(SMALL, nfe=policy.sampling.evaluations()) if config is None else config
+
+    def environment(seed: int) -> EnvBase:
+        # Outside of the workers one anchor draws for all environments.
+        env = TransformedEnv(parallel_env(*builders, num_envs), PriorAnchor(policy))
+        env.set_seed(seed, static_seed=True)
+        return env
+
+    with torch_threads(1):  # TorchRL resets the number of threads when workers end
+        training = PriorSpaceTraining(
+            policy, environment, config, directory, evaluation_seed=EVALUATION_SEED, description=description
+        )
+        curve = training.run()
+        improved = training.policy()
+        env = parallel_env(*builders, num_envs)
+        solved: list[int] = []
+        for name, played in (("before", policy.replace(nfe=config.nfe)), ("after", improved)):
+            outcomes = evaluate(
+                played,
+                env,
+                episodes=episodes,
+                first_seed=EVALUATION_SEED + REPORTED,
+                policy_seed=config.seed,
+                description=None if description is None else name,
+            )
+            solved.append(sum(outcome.success for outcome in outcomes))
+        env.close(raise_if_closed=False)
+    before, after = solved
+    return Improvement(improved, before, after, episodes, curve)
