@@ -49,6 +49,13 @@ class Improvement:
         after: solved episodes of ``policy``.
         episodes: number of episodes of each, from the same starts, by which nothing was chosen.
         curve: the evaluations by which the policy was chosen, see :meth:`PriorSpaceTraining.run`.
+
+    Examples:
+        >>> from warmprior import Improvement, PastPrior, VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
+        >>> result = Improvement(actor, before=40, after=90, episodes=100, curve=[])
+        >>> result.after > result.before
+        True
     """
 
     policy: WarmPriorActor
@@ -100,7 +107,7 @@ def improve_policy(
         >>> from functools import partial
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
-        >>> from warmprior.rl import PriorSpaceConfig, improve_policy
+        >>> from warmprior import PriorSpaceConfig, improve_policy
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
         >>> config = PriorSpaceConfig(
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,

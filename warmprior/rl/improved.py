@@ -39,7 +39,7 @@ class AgentStart(StartPoint):
             PyTorch's global generator.
 
     See Also:
-        :func:`~warmprior.rl.improved_policy`: builds the policy of a trained agent.
+        :func:`~warmprior.improved_policy`: builds the policy of a trained agent.
 
     Examples:
         >>> import torch
@@ -127,7 +127,7 @@ def improved_policy(
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, make_prior_space_actor
-        >>> from warmprior.rl import improved_policy
+        >>> from warmprior import improved_policy
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1)
         >>> agent = make_prior_space_actor(2, 3, 4, delta=0.5, hidden_dim=16)  # untrained here
         >>> policy = improved_policy(actor, agent)
