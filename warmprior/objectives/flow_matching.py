@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, cast, get_args
 
@@ -207,11 +207,15 @@ class FlowMatchingLoss(Drawing, LossModule):
     def _check_normalised(self, a1: Tensor) -> None:
         """Raise ValueError if the first batch is in raw units, but the policy has a normaliser."""
         self._looked_at = True
+        actor = self.actor_network
         largest = float(a1.nan_to_num(0.0, 0.0, 0.0).abs().max()) if a1.numel() else 0.0
-        if self.actor_network.normalizer is not None and largest > FAR_OUTSIDE:
+        # A policy is clipped to the range of its demonstrations, which some units leave larger than 1.
+        clip = actor.sampling.clip
+        bound = max(1.0, max(clip) if isinstance(clip, Sequence) else clip or 1.0)
+        if actor.normalizer is not None and largest > FAR_OUTSIDE * bound:
             raise ValueError(
-                f"the targets {self.tensor_keys.chunk!r} reach {largest:.4g}, but the policy's normaliser "
-                "maps actions to [-1, 1]: make the windows from policy.normalizer.normalize(data)"
+                f"the targets {self.tensor_keys.chunk!r} reach {largest:.4g}, but the policy's normaliser maps "
+                f"actions to +-{bound:.4g}: make the windows from policy.normalizer.normalize(data)"
             )
 
     def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> tuple[Tensor | None, bool]:
