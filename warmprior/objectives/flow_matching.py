@@ -214,8 +214,8 @@ class FlowMatchingLoss(Drawing, LossModule):
         bound = max(1.0, max(clip) if isinstance(clip, Sequence) else clip or 1.0)
         if actor.normalizer is not None and largest > FAR_OUTSIDE * bound:
             raise ValueError(
-                f"the targets {self.tensor_keys.chunk!r} reach {largest:.4g}, but the policy's normaliser maps "
-                f"actions to +-{bound:.4g}: make the windows from policy.normalizer.normalize(data)"
+                f"the targets {self.tensor_keys.chunk!r} reach {largest:.4g}, but the policy's normaliser "
+                f"maps actions to +-{bound:.4g}: make the windows from policy.normalizer.normalize(data)"
             )
 
     def _weight(self, tensordict: TensorDictBase, a1: Tensor) -> tuple[Tensor | None, bool]:
