@@ -1,6 +1,5 @@
 """Draw and write the leaderboard: success of methods on human and on scripted demonstrations, by NFE.
 
-
 PYTHONPATH=benchmarks python docs/figures/leaderboard.py    # or: make results; writes a picture and a table
 
 95% intervals count trainings, as in results.py. A rank is among all lines of the table, and its interval is
@@ -167,18 +166,34 @@ def table(sets: Sets) -> str:
     return "\n".join(text) + "\n"
 
 
+def short_table(sets: Sets) -> str:
+    """Return a line per method in Markdown: its mean at nine evaluations, or all it has, and at one."""
+    means = standings(sets).set_index(["source", "nfe"])["mean"]
+    most = {source: max(n for s, n in means.index if s == source) for source, _ in means.index}
+    rates = {source: means[source, nfe] for source, nfe in most.items()}
+    return _lines_of(sorted(most, key=lambda source: -rates[source]), means.to_dict(), most, sets)
+
+
 def one_seed_table() -> str:
     """Return the mean success of a single training per set in Markdown, of the methods that have only one."""
     rows = trials().query("seed == 0")
     rates = rows.groupby(["source", "nfe", "set"])["success_rate"].mean().groupby(["source", "nfe"])
     means = 100 * rates.mean()[rates.size() == len(HUMAN)]
+    sources = [GAUSSIAN, *sorted({source for source, _ in means.index} - {*standings()["source"]})]
+    return _lines_of(sources, means.to_dict(), dict.fromkeys(sources, 9), HUMAN)
+
+
+def _lines_of(
+    sources: Sequence[str], means: Mapping[tuple[str, int], float], most: Mapping[str, int], sets: Sets
+) -> str:
     text = ["| method | NFE 9 | ahead:behind | NFE 1 | ahead:behind |", "|---" * 5 + "|"]
-    for source in (GAUSSIAN, *sorted({source for source, _ in means.index} - {*standings()["source"]})):
+    for source in sources:
         cells = []
-        for setting in ((source, 9), (source, 1)):
+        for setting in ((source, most[source]), (source, 1)):
             played = setting in means
-            cells.append(f"{means[setting] + 1e-6:.0f}" if played else "")
-            cells.append(str(beside_source(*setting)) if played and source != GAUSSIAN else "")
+            other = f" (NFE {setting[1]})" if setting[1] not in (9, 1) else ""
+            cells.append(f"{means[setting] + 1e-6:.0f}{other}" if played else "")
+            cells.append(str(beside_source(*setting, sets=sets)) if played and source != GAUSSIAN else "")
         text.append(f"| {SOURCES[source][0]} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
@@ -204,7 +219,8 @@ def effect_table() -> str:
 def tables() -> dict[Path, list[str]]:
     """Return the tables of each page."""
     return {
-        PAGE: [table(HUMAN), one_seed_table(), table(SCRIPTED)],
+        PAGE: [short_table(HUMAN), short_table(SCRIPTED)],
+        DOCS / "notes" / "leaderboard.md": [table(HUMAN), one_seed_table(), table(SCRIPTED)],
         DOCS / "paper.md": [effect_table(), paper_table()],
     }
 
