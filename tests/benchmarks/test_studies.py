@@ -1,7 +1,5 @@
-import importlib
 import json
 import shutil
-from functools import partial
 from itertools import product
 
 import budget
@@ -26,17 +24,6 @@ from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import Task, load_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_steps():
-    """Flows are measured in few steps: what is looked at here is what becomes of the numbers."""
-    with pytest.MonkeyPatch.context() as patch:
-        for place in ("lab.measures.curvature", "curvature.flow_paths", "navigation1d.flow_paths"):
-            module, name = place.rsplit(".", 1)
-            measure = getattr(importlib.import_module(module), name)
-            patch.setattr(place, partial(measure, n_steps=10))
-        yield
 
 
 @pytest.fixture(scope="module")
