@@ -1,4 +1,6 @@
+import functools
 import gc
+import multiprocessing
 import os
 import random
 import subprocess
@@ -56,6 +58,14 @@ def renders_apart():
     before = start_method()
     yield
     assert start_method() == before, "let what renders run in tests.processes.apart"
+
+
+@pytest.fixture
+def forked_workers(monkeypatch):
+    """Workers of this machine know what was imported and patched here; fresh ones import for seconds."""
+    loky = pytest.importorskip("loky")
+    fork = {"context": multiprocessing.get_context("fork")}
+    monkeypatch.setattr("loky.ProcessPoolExecutor", functools.partial(loky.ProcessPoolExecutor, **fork))
 
 
 @pytest.fixture(scope="module")

@@ -51,6 +51,40 @@ print(actor(batch)["vla_action", "chunk"].shape)
 """
 
 
+# TorchRL imports simulators itself where they are installed.
+LOADED = """
+import sys
+import torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.record
+before = set(sys.modules)
+import warmprior
+print(*[n for n in {heavy} if n in sys.modules])
+import warmprior.training
+print(*sorted(set(sys.modules) - before))
+for name in [n for n in sys.modules if n.split(".")[0] == "warmprior"]:
+    del sys.modules[name]
+"""
+LOCKED = """
+import pathlib
+sys.modules["fcntl"] = None
+import warmprior.training
+from warmprior.io.files import exclusive
+with exclusive(pathlib.Path({folder!r})):
+    print("inside")
+"""
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory):
+    """What a fresh process says that imports the package, then without packages and without locks of files.
+
+    The last again is what other tests ask for, too: a process takes seconds to import PyTorch.
+    """
+    folder = tmp_path_factory.mktemp("locked") / "new"
+    code = LOADED.format(heavy=HEAVY) + BLOCK.format(names=OPTIONAL) + LOCKED.format(folder=str(folder)) + TRAINED
+    done = ran(code)
+    return folder, done.stdout.splitlines(), done.stderr
+
+
 def test_optional_packages_are_not_imported_and_a_policy_trains_without_them():
     """Of the former those that TorchRL does not import itself where they are installed."""
     heavy = ("robosuite", "lerobot", "h5py", "matplotlib", "numba", "tyro")

@@ -1,9 +1,6 @@
-import functools
 import json
-import multiprocessing
 from itertools import product
 
-import loky
 import pytest
 import robomimic
 import torch
@@ -45,12 +42,12 @@ def finished(inline, tmp_path_factory):
     return out
 
 
-def test_rows_have_an_order_and_do_not_depend_on_who_computes(finished, inline, tmp_path, monkeypatch):
+def test_rows_have_an_order_and_do_not_depend_on_who_computes(
+    finished, inline, tmp_path, monkeypatch, forked_workers
+):
     cells = [(r["prior"], r["seed"], r["checkpoint"], r["nfe"]) for r in stored(finished)]
     assert cells == list(product(("gaussian", "past", "preview"), (0, 1), (10, 20), (3, 1)))
     # In two processes: there the episodes come in another order. Fresh ones are in test_tasks.py.
-    fork = {"context": multiprocessing.get_context("fork")}
-    monkeypatch.setattr("loky.ProcessPoolExecutor", functools.partial(loky.ProcessPoolExecutor, **fork))
     monkeypatch.setattr(jobs, "Local", inline)
     assert apart(robomimic.main)(arguments(tmp_path / "out", prior="past", envs=2)) == 0
     assert untimed(tmp_path / "out") == untimed(finished)

@@ -1,5 +1,5 @@
 import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from lab.policies import policies_of
 from lab.stored_options import stored_options
 from lab.tasks import DataOptions
 from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
-from tests.data.synthetic import env_args_14, write_robomimic_file
+from tests.data.synthetic import env_args_14, shortened, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 from tests.errors import raises
-from tests.processes import apart
+from tests.processes import apart, here
 from warmprior import ImageEncoder
 from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
 from warmprior.diagnostics import encoded_windows
@@ -86,12 +86,14 @@ def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path
 def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
+    monkeypatch.setattr("lab.render.working", here)
     few = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
-    argv = options(lift_demonstrations, tmp_path / "run", prior=["gaussian", "history"], **few)
+    file = shortened(lift_demonstrations, tmp_path / "lift.hdf5", 12)
+    argv = options(file, tmp_path / "run", prior=["gaussian", "history"], **few)
     assert apart(robomimic.main)([*argv, "--fast-rendering"]) == 0
     assert [row["obs"] for row in stored(tmp_path / "run")] == ["image"] * 2
     assert described(tmp_path / "run", "tasks")[0]["images"]["fast_rendering"] is True
-    measured = apart(flow)(tmp_path / "run", lift_demonstrations)
+    measured = apart(flow)(tmp_path / "run", file)
     assert "Lift-PH, image observations" in measured and "| History |" in measured
     # By hand: the encoder's features of raw images stand in place of them.
     (path,) = tmp_path.glob("cache/rendered/*.hdf5")
@@ -149,17 +151,37 @@ def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
     torch.testing.assert_close(moved["action"] + raw["observation"][:, :2], raw["action"])
 
 
-def test_a_file_in_mimicgens_environment(tmp_path):
-    """As a user starts it: the package is not taken for the script, nor is it missed by workers."""
-    write_mimicgen(tmp_path / "site")
-    file, out = tmp_path / "stack.hdf5", tmp_path / "out"
+def start(script, argv, site):
+    """Run a script as from a shell, with a package in this folder; what is not ours was imported before.
+
+    Its workers are fresh processes, and know no patches.
+    """
+    ours = {"warmprior", "lab", *(path.stem for path in script.parent.glob("*.py"))}
+    for name in [name for name in sys.modules if name.split(".")[0] in ours]:
+        del sys.modules[name]
+    found = [str(script.parent), str(script.parents[1]), str(site)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(found[1:])
+    sys.path[:], sys.argv[:] = [*found, *sys.path], [str(script), *argv]
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    return ended.value.code
+
+
+def test_a_file_in_mimicgens_environment(tmp_path, monkeypatch):
+    """The package is not taken for the script, nor is it missed by workers.
+
+    Rows do not depend on the processes that compute them: those of fresh ones are those of this one.
+    """
+    site, file, out = (tmp_path / name for name in ("site", "stack.hdf5", "out"))
+    write_mimicgen(site)
     write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
-    argv = options(file, out, task=None, prior="past", demonstrations=2, time_limit=9)
-    script = Path(mimicgen_tasks.__file__)
-    path = os.pathsep.join(map(str, (script.parents[1], tmp_path / "site")))
-    command, env = [sys.executable, str(script), *argv], os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(command, env=env, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    few = {"task": None, "prior": "past", "demonstrations": 2, "time_limit": 9, "iterations": 4}
+    argv = [*options(file, out, **few), "--no-videos"]
+    assert apart(start)(Path(mimicgen_tasks.__file__), argv, site) == 0
     (row,), (task,) = stored(out), described(out, "tasks")
     assert (row["task"], row["data"]) == ("stack_d0", "source")
     assert (task["demonstrations"], task["steps"]) == (2, 50)
+    monkeypatch.syspath_prepend(site)
+    assert apart(mimicgen_tasks.main)(options(file, tmp_path / "mine" / "out", **few)) == 0
+    (mine,) = stored(tmp_path / "mine" / "out")
+    assert mine | {"training_seconds": None} == row | {"training_seconds": None}

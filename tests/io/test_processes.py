@@ -12,7 +12,7 @@ pytest.importorskip("loky")
 
 from lab.workers import working
 from tests.errors import raises
-from tests.processes import ended
+from tests.processes import apart, ended
 from warmprior.io.workers import WorkerError
 
 
@@ -51,7 +51,8 @@ def sleepers(folder, count):
     return [int(path.name) for path in folder.iterdir()]
 
 
-def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_all(tmp_path):
+@apart
+def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_all(tmp_path, forked_workers):
     state = []
     with raises(FloatingPointError, "the loss became nan"), working(2, state) as call:
         found = [call(partial(remember, i)).result() for i in range(6)]
@@ -67,7 +68,8 @@ def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_a
     wait_for(lambda: all(map(ended, [pid, *pids])), 20)
 
 
-def test_a_dead_process_ends_all_others(tmp_path):
+@apart
+def test_a_dead_process_ends_all_others(tmp_path, forked_workers):
     with raises(WorkerError, 2, "memory") as raised, working(2, None) as call:
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)
