@@ -15,9 +15,9 @@ import h5py
 
 from lab import render as render_module
 from lab.render import render_demonstrations
+from tests.data.synthetic import shortened
 from tests.errors import missing, raises
 from tests.processes import apart, here
-from tests.data.synthetic import shortened
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, RobomimicDemonstrations
