@@ -24,10 +24,25 @@ LONG = [
 ]
 """Files of tens of seconds, which start first: begun last, one of them would keep a single core busy."""
 
+ALSO_OF_LEROBOT = ["tests/test_given_blocks.py", "tests/data/test_convert.py"]
+
 
 def pytest_configure(config):
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False  # else those of most tests start first
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Let one process run all tests of LeRobot, whose import takes seconds; others are given out by file."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = super()._split_scope(nodeid)
+            return "lerobot" if "lerobot" in file or file in ALSO_OF_LEROBOT else file
+
+    return ByFile(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 def pytest_sessionstart(session):
