@@ -24,7 +24,10 @@ LONG = [
 ]
 """Files of tens of seconds, which start first: begun last, one of them would keep a single core busy."""
 
-ALSO_OF_LEROBOT = ["tests/test_given_blocks.py", "tests/data/test_convert.py"]
+ALSO_OF_LEROBOT = [
+    *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
+    *("tests/benchmarks/test_joint_targets.py", "tests/training/test_task.py"),
+]
 
 
 def pytest_configure(config):
