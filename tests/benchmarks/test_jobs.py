@@ -138,8 +138,9 @@ def is_a_worker_that_hears_no_ctrl_c(process):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_no_worker_outlives_the_driver(how):
-    """The driver is forked, and its worker is a fresh process."""
+def test_no_worker_outlives_the_driver(how, monkeypatch):
+    """The driver is forked, and its worker is a fresh process of one thread."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
     fork = multiprocessing.get_context("fork")
     (said, out), (errors, err) = (fork.Pipe(duplex=False) for _ in range(2))
     process = fork.Process(target=drive, args=(out, err))
@@ -151,6 +152,8 @@ def test_no_worker_outlives_the_driver(how):
     while not any(map(is_a_worker_that_hears_no_ctrl_c, children := driver.children(recursive=True))):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    workers = filter(is_a_worker_that_hears_no_ctrl_c, children)
+    assert {worker.environ()["OMP_NUM_THREADS"] for worker in workers} == {"1"}
     # As Ctrl-C on a terminal does: all of them get it.
     os.killpg(process.pid, how) if how == signal.SIGINT else os.kill(process.pid, how)
     process.join(30)

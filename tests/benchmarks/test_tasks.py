@@ -110,7 +110,8 @@ def start(script, argv, site):
     for name in [name for name in sys.modules if name.split(".")[0] in ours]:
         del sys.modules[name]
     found = [str(script.parent), str(script.parents[1]), str(site)]
-    os.environ["PYTHONPATH"] = os.pathsep.join(found[1:])
+    before = filter(None, [os.environ.get("PYTHONPATH")])
+    os.environ["PYTHONPATH"] = os.pathsep.join([*found[1:], *before])
     sys.path[:], sys.argv[:] = [*found, *sys.path], [str(script), *argv]
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")
