@@ -26,7 +26,8 @@ LONG = [
 
 ALSO_OF_LEROBOT = [
     *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
-    *("tests/benchmarks/test_joint_targets.py", "tests/training/test_task.py"),
+    *("tests/benchmarks/test_joint_targets.py", "tests/benchmarks/test_paper_facts.py"),
+    "tests/training/test_task.py",
 ]
 
 
