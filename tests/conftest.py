@@ -1,4 +1,6 @@
+import functools
 import gc
+import multiprocessing
 import os
 import random
 import subprocess
@@ -6,23 +8,7 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
-import hypothesis
 import pytest
-import torch
-
-# The tests' tensors are small: a second thread gains nothing, and on a busy machine costs much. TorchRL goes
-# back to the number that it was imported with when an environment closes, and with more than one a process
-# forked after that would wait for threads that it lacks: so before it is imported.
-if "OMP_NUM_THREADS" not in os.environ:
-    torch.set_num_threads(1)
-
-from tests.processes import here
-from warmprior.envs.tasks import TaskSpec
-from warmprior.io.workers import start_method
-
-# Timings on a shared machine say nothing: no test fails for being slow once.
-hypothesis.settings.register_profile("shared-machine", deadline=None)
-hypothesis.settings.load_profile("shared-machine")
 
 collect_ignore = ["rows"]  # part of other runs, see there
 
@@ -31,13 +17,65 @@ def pytest_addoption(parser):
     parser.addoption("--shuffle", type=int, help="a seed: run the files, and the tests of each, in its order")
 
 
+LONG = [
+    *("benchmarks/test_tasks.py", "benchmarks/test_studies.py", "benchmarks/test_policies.py"),
+    *("rl/test_training.py", "envs/test_robosuite.py", "benchmarks/test_prior_space_rl.py"),
+    *("deploy/test_exported.py", "benchmarks/test_robomimic.py", "training/test_evaluation.py"),
+]
+"""Files of tens of seconds, which start first: begun last, one of them would keep a single core busy."""
+
+ALSO_OF_LEROBOT = [
+    *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
+    *("tests/benchmarks/test_joint_targets.py", "tests/benchmarks/test_paper_facts.py"),
+    "tests/training/test_task.py",
+]
+
+
+def pytest_configure(config):
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # else those of most tests start first
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Let one process run all tests of LeRobot, whose import takes seconds; others are given out by file."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = super()._split_scope(nodeid)
+            return "lerobot" if "lerobot" in file or file in ALSO_OF_LEROBOT else file
+
+    return ByFile(config, log) if config.getoption("dist") == "loadfile" else None
+
+
+def pytest_sessionstart(session):
+    """Prepare a process that runs tests; one that hands them out to others need not import PyTorch."""
+    if session.config.getoption("numprocesses", None):
+        return
+    import hypothesis
+    import torch
+
+    # The tests' tensors are small: a second thread gains nothing, and on a busy machine costs much. TorchRL
+    # goes back to the number that it was imported with when an environment closes, and with more than one a
+    # process forked after that would wait for threads that it lacks: so before it is imported.
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
+    # Timings on a shared machine say nothing: no test fails for being slow once.
+    hypothesis.settings.register_profile("shared-machine", deadline=None)
+    hypothesis.settings.load_profile("shared-machine")
+
+
 def pytest_collection_modifyitems(config, items):
-    """Without a GPU the tests that need one are skipped, each by its name."""
+    """Long files come first. Without a GPU the tests that need one are skipped, each by its name."""
+    import torch
+
+    places = {Path(__file__).parent / name: place for place, name in enumerate(LONG, -len(LONG))}
     if (seed := config.getoption("shuffle")) is not None:
         draw = random.Random(seed)
         draw.shuffle(items)
         places = {item.path: draw.random() for item in items}
-        items.sort(key=lambda item: places[item.path])
+    items.sort(key=lambda item: places.get(item.path, 0))
     for item in items:
         if item.get_closest_marker("cuda") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="needs a GPU"))
@@ -53,14 +91,26 @@ def forks_copy_little():
 @pytest.fixture(autouse=True)
 def renders_apart():
     """No test leaves behind a process of which forked workers could not render."""
+    from warmprior.io.workers import start_method
+
     before = start_method()
     yield
     assert start_method() == before, "let what renders run in tests.processes.apart"
 
 
+@pytest.fixture
+def forked_workers(monkeypatch):
+    """Workers of this machine know what was imported and patched here; fresh ones import for seconds."""
+    loky = pytest.importorskip("loky")
+    fork = {"context": multiprocessing.get_context("fork")}
+    monkeypatch.setattr("loky.ProcessPoolExecutor", functools.partial(loky.ProcessPoolExecutor, **fork))
+
+
 @pytest.fixture(scope="module")
 def short_episodes():
     """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
+    from warmprior.envs.tasks import TaskSpec
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
         yield
@@ -73,6 +123,7 @@ def lift_demonstrations(tmp_path_factory):
     from filelock import FileLock
 
     from lab.scripted.generate import generate_demonstrations
+    from tests.processes import here
 
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder

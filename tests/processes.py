@@ -1,6 +1,7 @@
 import functools
 import gc
 import multiprocessing
+import pickle
 import traceback
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -53,12 +54,16 @@ def apart(function):
 
 @contextmanager
 def here(count, state):
-    """:func:`~warmprior.io.workers.working` in this process, where others would take seconds to start."""
+    """``lab.workers.working`` in this process, where others would take seconds to start.
+
+    State and jobs are pickled, as for others.
+    """
+    state = pickle.loads(pickle.dumps(state))
 
     def call(job):
         future = Future()
         try:
-            future.set_result(job(state))
+            future.set_result(pickle.loads(pickle.dumps(job))(state))
         except Exception as error:
             future.set_exception(error)
         return future

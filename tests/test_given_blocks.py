@@ -12,7 +12,7 @@ from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import TOKEN, model_hub
 from tests.lerobot.conftest import found  # noqa: F401
-from tests.lerobot.plugin_policies import saved_flow_policy
+from tests.lerobot.plugin_policies import NEEDS_PLUGIN, saved_flow_policy
 from tests.lerobot.test_actor import Arm, preprocessed
 from tests.lerobot.tiny import ACTION, CAMERA, STATE, make_smolvla
 from tests.test_blocks import BLOCKS, GIVEN
@@ -20,7 +20,7 @@ from tests.toy_env import Halfway, demonstrations, mlp_actor
 from warmprior import GaussianPrior, Normalizer, PastPrior
 from warmprior.training import TrainingConfig, save_policy
 
-pytest.importorskip("lerobot_policy_warmprior")
+pytestmark = NEEDS_PLUGIN
 
 
 @pytest.fixture

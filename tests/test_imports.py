@@ -51,13 +51,60 @@ print(actor(batch)["vla_action", "chunk"].shape)
 """
 
 
-def test_optional_packages_are_not_imported_and_a_policy_trains_without_them():
+# TorchRL imports simulators itself where they are installed.
+LOADED = """
+import sys
+import torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.record
+before = set(sys.modules)
+import warmprior
+print(*sys.modules)
+import warmprior.training
+print(*set(sys.modules) - before)
+for name in [name for name in sys.modules if name.split(".")[0] == "warmprior"]:
+    del sys.modules[name]
+"""
+LOCKED = """
+import pathlib
+sys.modules["fcntl"] = None
+import warmprior.training
+from warmprior.io.files import exclusive
+with exclusive(pathlib.Path({folder!r})):
+    print("inside")
+"""
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory):
+    """A folder, and what a process says: it imports the package, then again without other packages and locks.
+
+    PyTorch, whose import takes seconds, is imported once.
+    """
+    folder = str(tmp_path_factory.mktemp("fresh") / "new")
+    done = ran(LOADED + BLOCK.format(names=OPTIONAL) + LOCKED.format(folder=folder) + TRAINED)
+    return folder, done
+
+
+def test_optional_packages_are_not_imported_and_a_policy_trains_without_them(fresh):
     """Of the former those that TorchRL does not import itself where they are installed."""
-    heavy = ("robosuite", "lerobot", "h5py", "matplotlib", "numba", "tyro")
-    code = f"import sys, warmprior; print([n for n in {heavy} if n in sys.modules])\n"
-    again = "for name in [n for n in sys.modules if n.split('.')[0] == 'warmprior']: del sys.modules[name]\n"
-    done = ran(code + again + BLOCK.format(names=OPTIONAL) + TRAINED)
-    assert done.stdout.splitlines()[-2:] == ["[]", "torch.Size([8, 4, 2])"]
+    loaded, *_, trained = fresh[1].stdout.splitlines()
+    heavy = {"robosuite", "lerobot", "h5py", "matplotlib", "numba", "tyro"}
+    assert "warmprior" in loaded.split() and not heavy & set(loaded.split())
+    assert trained == "torch.Size([8, 4, 2])"
+
+
+def test_training_loads_neither_simulator_nor_renderer_nor_experts(fresh):
+    new = set(fresh[1].stdout.splitlines()[1].split())
+    assert "warmprior.training.train" in new
+    heavy = {"robosuite", "mujoco", "OpenGL", "numba", "h5py", "lerobot", "loky", "matplotlib", "tyro"}
+    assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
+    rooms = {".".join(name.split(".")[:2]) for name in new}
+    assert not rooms & {"warmprior.envs", "warmprior.data", "warmprior.lerobot", "warmprior.deploy"}
+
+
+def test_folders_are_used_without_locks_where_the_system_has_none(fresh):
+    folder, done = fresh
+    assert done.stdout.splitlines()[2] == "inside"
+    assert folder in done.stderr and "one process" in done.stderr
 
 
 ROOMS = [
@@ -118,25 +165,6 @@ def test_the_package_knows_no_benchmark():
         assert not roots & {"lab", "benchmarks", *(script.stem for script in BENCHMARKS.glob("*.py"))}, path
 
 
-# TorchRL imports simulators itself where they are installed.
-LOADED = """
-import sys
-import torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.record
-before = set(sys.modules)
-import warmprior.training
-print(*sorted(set(sys.modules) - before))
-"""
-
-
-def test_training_loads_neither_simulator_nor_renderer_nor_experts():
-    new = set(ran(LOADED).stdout.split())
-    assert "warmprior.training.train" in new
-    heavy = {"robosuite", "mujoco", "OpenGL", "numba", "h5py", "lerobot", "loky", "matplotlib", "tyro"}
-    assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
-    rooms = {".".join(name.split(".")[:2]) for name in new}
-    assert not rooms & {"warmprior.envs", "warmprior.data", "warmprior.lerobot", "warmprior.deploy"}
-
-
 def test_a_renderer_that_cannot_be_loaded_stops_no_import(tmp_path):
     pytest.importorskip("mujoco")
     (tmp_path / "OpenGL").mkdir()  # as without the library: PyOpenGL raises this
@@ -147,12 +175,3 @@ def test_a_renderer_that_cannot_be_loaded_stops_no_import(tmp_path):
     done = ran(code, MUJOCO_GL="osmesa", PYTHONPATH=path)
     assert done.stdout.split() == ["None", warmprior.__version__]
     assert "MUJOCO_GL=osmesa" in done.stderr and "glGetError" in done.stderr
-
-
-def test_folders_are_used_without_locks_where_the_system_has_none(tmp_path):
-    code = "import sys; sys.modules['fcntl'] = None\n"
-    code += "import warmprior.training, pathlib; from warmprior.io.files import exclusive\n"
-    code += f"with exclusive(pathlib.Path({str(tmp_path / 'new')!r})) as _: print('inside')"
-    done = ran(code)
-    assert done.stdout.split() == ["inside"]
-    assert str(tmp_path / "new") in done.stderr and "one process" in done.stderr

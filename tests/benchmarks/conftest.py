@@ -1,5 +1,6 @@
 import importlib.util
 from concurrent.futures import Future
+from functools import partial
 
 import pytest
 
@@ -37,7 +38,10 @@ def sketch(figure, path, **options):
 
 @pytest.fixture(scope="module", autouse=True)
 def inline(request, short_episodes):
-    """Jobs are computed here, charts are sketched, and no video is made, unless a test asks for it."""
+    """Jobs are computed here, charts are sketched, and no video is made, unless a test asks for it.
+
+    Flows are measured in few steps: what is looked at is what becomes of the numbers.
+    """
     if request.path.name == "test_jobs.py":
         yield
         return
@@ -50,6 +54,11 @@ def inline(request, short_episodes):
         local = jobs.Local
         patch.setattr(jobs, "Local", Inline)
         patch.setattr(pictures, "rendering_backend", lambda: None)
+        places = ("lab.measures.curvature", "curvature.flow_paths", "navigation1d.flow_paths")
+        for place in places if request.path.name != "test_measures.py" else ():  # there they are compared
+            module, name = place.rsplit(".", 1)
+            measure = getattr(importlib.import_module(module), name)
+            patch.setattr(place, partial(measure, n_steps=10))
         if request.path.name != "test_plots.py":  # there they are looked at
             patch.setattr(Figure, "savefig", sketch)
         yield local

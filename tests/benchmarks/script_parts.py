@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 
 def command_line(**options):
@@ -43,3 +44,12 @@ def written(folder):
 
 def is_png(path):
     return path.read_bytes().startswith(b"\x89PNG")
+
+
+def flow(run, validation, **more):
+    """The report on the flows of a finished run."""
+    import curvature
+
+    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6}
+    assert curvature.main(command_line(**few | more)) == 0
+    return Path(f"{run}-flow", "report.md").read_text()

@@ -5,13 +5,11 @@ import multiprocessing
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from concurrent.futures import Future
 from pathlib import Path
 
-import loky
 import psutil
 import pytest
 
@@ -21,6 +19,7 @@ from lab.options import Run
 from tests.benchmarks.conftest import Inline
 from tests.errors import raises
 from tests.processes import apart
+from warmprior.io.script import run_script
 
 
 class AwkwardError(Exception):
@@ -49,12 +48,9 @@ def play(folder, number, episode):
 
 @pytest.mark.parametrize("engine", ["local", pytest.param("ray", marks=pytest.mark.slow)])
 @apart  # no fork survives a connection to Ray
-def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys):
+def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys, forked_workers):
     if engine == "ray":
         pytest.importorskip("ray")
-    # Five workers start, of which four die: none imports all over again.
-    fork = {"context": multiprocessing.get_context("fork")}
-    monkeypatch.setattr("loky.ProcessPoolExecutor", functools.partial(loky.ProcessPoolExecutor, **fork))
     monkeypatch.setattr(jobs, "DEATHS", 2)
     (tmp_path / "dies").touch()  # the first worker of job 4 is killed while it trains
     for name in ("out", "policies"):
@@ -115,19 +111,23 @@ def test_the_last_trainings_start_before_episodes_and_an_error_kills_the_workers
     assert engine.killed is True
 
 
-SLEEP = """
-import sys, time
-from lab.jobs import Jobs
-from lab.options import Run
-from warmprior.io.script import run_script
-def main():
+def sleeping():
     with Jobs(Run(envs=1)) as pool:
         for i in range(2):
             pool.submit(f"sleep {i}", time.sleep, 60)
         print("ready", flush=True)
         pool.wait()
-sys.exit(run_script(main, "sleep.py"))
-"""
+
+
+def drive(out, err):
+    """Run a script of which the workers sleep, in a session of its own as after a terminal's shell."""
+    os.setsid()
+    for ours, theirs in ((out, 1), (err, 2)):
+        os.dup2(ours.fileno(), theirs)
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
+    # A shell may have the signal ignored for what it starts in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.exit(run_script(sleeping, "sleep.py"))
 
 
 def is_a_worker_that_hears_no_ctrl_c(process):
@@ -138,27 +138,30 @@ def is_a_worker_that_hears_no_ctrl_c(process):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_no_worker_outlives_the_driver(how, tmp_path):
-    script, root = tmp_path / "sleep.py", Path(__file__).parents[2]
-    script.write_text(SLEEP)
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root / "benchmarks")])}
-    # A shell may have the signal ignored for what it starts in the background.
-    heard = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "start_new_session": True}
-    process = subprocess.Popen([sys.executable, str(script)], env=env, **pipes, **heard)
-    assert process.stdout.readline() == b"ready\n"
+def test_no_worker_outlives_the_driver(how, monkeypatch):
+    """The driver is forked, and its worker is a fresh process of one thread."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    fork = multiprocessing.get_context("fork")
+    (said, out), (errors, err) = (fork.Pipe(duplex=False) for _ in range(2))
+    process = fork.Process(target=drive, args=(out, err))
+    process.start()
+    out.close(), err.close()
+    said, errors = (os.fdopen(os.dup(pipe.fileno())) for pipe in (said, errors))
+    assert said.readline() == "ready\n"
     driver, deadline = psutil.Process(process.pid), time.monotonic() + 60
     while not any(map(is_a_worker_that_hears_no_ctrl_c, children := driver.children(recursive=True))):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    workers = filter(is_a_worker_that_hears_no_ctrl_c, children)
+    assert {worker.environ()["OMP_NUM_THREADS"] for worker in workers} == {"1"}
     # As Ctrl-C on a terminal does: all of them get it.
     os.killpg(process.pid, how) if how == signal.SIGINT else os.kill(process.pid, how)
-    code = process.wait(30)
+    process.join(30)
     assert not psutil.wait_procs(children, timeout=15)[1]
     if how == signal.SIGINT:
-        assert code == 130
-        said = process.stderr.read().decode()
-        assert said.splitlines()[-1] == "sleep.py: interrupted" and "Traceback" not in said
+        assert process.exitcode == 130
+        lines = errors.read()
+        assert lines.splitlines()[-1] == "sleep.py: interrupted" and "Traceback" not in lines
 
 
 def test_without_a_terminal_trainings_say_now_and_then_how_far_they_are(tmp_path, monkeypatch, capsys):

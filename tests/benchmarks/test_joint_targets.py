@@ -6,12 +6,16 @@ import torch
 
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
+from tests.processes import here
 from warmprior.data import convert_robomimic
+from warmprior.envs.tasks import TaskSpec
 from warmprior.training import Task
 
 
 def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
+    monkeypatch.setattr("lab.scripted.generate.working", here)
+    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 400)  # an expert needs more
     task = joint_targets.task(DataOptions(demonstrations=(1,)))
     leader = h5py.File(generate_demonstrations("square", "ph", 1))["data/demo_0"]
     (path,) = tmp_path.rglob("*joint_targets.hdf5")

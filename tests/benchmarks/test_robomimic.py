@@ -19,11 +19,13 @@ from lab.presets import PRESETS
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.processes import apart
 from warmprior.envs import rendering_backend
+from warmprior.envs.tasks import TaskSpec
 from warmprior.training.checkpoint import load_state
 
 
 def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypatch):
     out = tmp_path / "runs" / "first"
+    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 16)  # episodes of two decisions
     with monkeypatch.context() as patch:
         patch.setattr(pictures, "rendering_backend", rendering_backend)
         assert apart(robomimic.main)(options(dataset, out, episodes=3)) == 0

@@ -1,11 +1,9 @@
 import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
-import curvature
 import mimicgen_tasks
-import pusht
 import pytest
 import robomimic
 import torch
@@ -13,14 +11,12 @@ import torch
 from lab.options import Options, with_parts
 from lab.policies import policies_of
 from lab.stored_options import stored_options
-from lab.tasks import DataOptions
-from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
-from tests.data.synthetic import env_args_14, write_robomimic_file
+from tests.benchmarks.script_parts import described, flow, options, refused, stored
+from tests.data.synthetic import env_args_14, shortened, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
-from tests.errors import raises
-from tests.processes import apart
+from tests.processes import apart, here
 from warmprior import ImageEncoder
-from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
+from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
@@ -28,12 +24,6 @@ from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
-
-
-def flow(run, validation, **more):
-    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6}
-    assert curvature.main(command_line(**few | more)) == 0
-    return Path(f"{run}-flow", "report.md").read_text()
 
 
 def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validation, tmp_path):
@@ -86,12 +76,14 @@ def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path
 def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
+    monkeypatch.setattr("lab.render.working", here)
     few = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
-    argv = options(lift_demonstrations, tmp_path / "run", prior=["gaussian", "history"], **few)
+    file = shortened(lift_demonstrations, tmp_path / "lift.hdf5", 12)
+    argv = options(file, tmp_path / "run", prior=["gaussian", "history"], **few)
     assert apart(robomimic.main)([*argv, "--fast-rendering"]) == 0
     assert [row["obs"] for row in stored(tmp_path / "run")] == ["image"] * 2
     assert described(tmp_path / "run", "tasks")[0]["images"]["fast_rendering"] is True
-    measured = apart(flow)(tmp_path / "run", lift_demonstrations)
+    measured = apart(flow)(tmp_path / "run", file)
     assert "Lift-PH, image observations" in measured and "| History |" in measured
     # By hand: the encoder's features of raw images stand in place of them.
     (path,) = tmp_path.glob("cache/rendered/*.hdf5")
@@ -109,57 +101,38 @@ def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monk
         torch.testing.assert_close(found, encoder(observation), atol=1e-5, rtol=0)
 
 
-def test_results_of_a_lerobot_dataset_are_those_of_the_file(dataset, tmp_path, monkeypatch):
-    pytest.importorskip("lerobot")
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    place = f"lerobot:{convert_robomimic(dataset, tmp_path / 'lift')}"
-    for name, data in (("file", dataset), ("lerobot", place)):
-        few = {"prior": "past", "iterations": 10, "task": None}
-        assert robomimic.main(options(data, tmp_path / name, **few)) == 0
-    (mine,), (theirs,) = (stored(tmp_path / name) for name in ("lerobot", "file"))
-    assert {k for k in mine if mine[k] != theirs[k]} <= {"policy", "training_seconds"}
-    facts, others = (described(tmp_path / name, "tasks")[0] for name in ("lerobot", "file"))
-    assert {k for k in facts if facts[k] != others[k]} == {"file", "sha256"}
-    # Found again from another working directory, and by the other benchmarks.
-    before = written(tmp_path / "policies")
-    monkeypatch.chdir(tmp_path)
-    assert robomimic.main(["--resume", "--out", "lerobot"]) == 0
-    assert "TRAINING demonstrations" in flow("lerobot", place)
-    assert written(tmp_path / "policies") == before
+def start(script, argv, site):
+    """Run a script as from a shell, with a package in this folder; what is not ours was imported before.
+
+    Its workers are fresh processes, and know no patches.
+    """
+    ours = {"warmprior", "lab", *(path.stem for path in script.parent.glob("*.py"))}
+    for name in [name for name in sys.modules if name.split(".")[0] in ours]:
+        del sys.modules[name]
+    found = [str(script.parent), str(script.parents[1]), str(site)]
+    before = filter(None, [os.environ.get("PYTHONPATH")])
+    os.environ["PYTHONPATH"] = os.pathsep.join([*found[1:], *before])
+    sys.path[:], sys.argv[:] = [*found, *sys.path], [str(script), *argv]
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    return ended.value.code
 
 
-def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
-    pytest.importorskip("lerobot")
-    from tests.data.lerobot_parts import write_lerobot
+def test_a_file_in_mimicgens_environment(tmp_path, monkeypatch):
+    """The package is not taken for the script, nor is it missed by workers.
 
-    widths = {"observation.state": 2, "observation.environment_state": 16, "action": 2}
-    features = {name: {"dtype": "float32", "shape": (n,), "names": None} for name, n in widths.items()}
-    write_lerobot(tmp_path / "pusht", lengths=(6, 4, 9), features=features)
-    place = f"lerobot:{tmp_path}/pusht"
-    given = [DataOptions(dataset=place, demonstrations=n) for n in ((), (2,), (4,))]
-    every, two = map(pusht.task, given[:2])
-    with raises(DatasetError, 3, "demos=4"):
-        pusht.task(given[2])
-    # The agent, then the block's corners; both within [-1, 1].
-    assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
-    assert every.data["observation"].abs().max().item() == pytest.approx(1.0)
-    assert every.success == "is_success" and every.measures == {"coverage": "max"}
-    # Offsets from where the agent is.
-    raw, moved = (t.normalizer.denormalize(t.data.clone()) for t in (every, pusht.relative(given[0])))
-    torch.testing.assert_close(moved["action"] + raw["observation"][:, :2], raw["action"])
-
-
-def test_a_file_in_mimicgens_environment(tmp_path):
-    """As a user starts it: the package is not taken for the script, nor is it missed by workers."""
-    write_mimicgen(tmp_path / "site")
-    file, out = tmp_path / "stack.hdf5", tmp_path / "out"
+    Rows do not depend on the processes that compute them: those of fresh ones are those of this one.
+    """
+    site, file, out = (tmp_path / name for name in ("site", "stack.hdf5", "out"))
+    write_mimicgen(site)
     write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
-    argv = options(file, out, task=None, prior="past", demonstrations=2, time_limit=9)
-    script = Path(mimicgen_tasks.__file__)
-    path = os.pathsep.join(map(str, (script.parents[1], tmp_path / "site")))
-    command, env = [sys.executable, str(script), *argv], os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(command, env=env, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    few = {"task": None, "prior": "past", "demonstrations": 2, "time_limit": 9, "iterations": 4}
+    argv = [*options(file, out, **few), "--no-videos"]
+    assert apart(start)(Path(mimicgen_tasks.__file__), argv, site) == 0
     (row,), (task,) = stored(out), described(out, "tasks")
     assert (row["task"], row["data"]) == ("stack_d0", "source")
     assert (task["demonstrations"], task["steps"]) == (2, 50)
+    monkeypatch.syspath_prepend(site)
+    assert apart(mimicgen_tasks.main)(options(file, tmp_path / "mine" / "out", **few)) == 0
+    (mine,) = stored(tmp_path / "mine" / "out")
+    assert mine | {"training_seconds": None} == row | {"training_seconds": None}

@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -85,3 +86,25 @@ def write_robomimic_file(
         for key, numbers in (masks or {}).items():
             file[f"mask/{key}"] = np.array([f"demo_{n}".encode() for n in numbers], dtype="S")
     return demos
+
+
+def shortened(file: Path, path: Path, steps: int) -> Path:
+    """Write the first steps of a file's first two of three demos to another file; return its path."""
+    shutil.copy(file, path)
+    with h5py.File(path, "a") as copy:
+        del copy["data/demo_2"]
+        copy["data"].attrs["total"] = 2 * steps
+        for name, names in list(copy["mask"].items()):
+            kept = [demo for demo in names[()] if demo != b"demo_2"]
+            del copy["mask"][name]
+            copy["mask"][name] = np.array(kept, dtype="S8")
+        for demo in copy["data"].values():
+            demo.attrs["num_samples"] = steps
+            demo.pop("next_obs", None)
+            for group in (demo, demo["obs"]):
+                for name, rows in list(group.items()):
+                    if isinstance(rows, h5py.Dataset):
+                        kept = rows[:steps]
+                        del group[name]
+                        group[name] = kept
+    return path

@@ -12,12 +12,12 @@ pytest.importorskip("loky")
 
 from lab.workers import working
 from tests.errors import raises
-from tests.processes import ended
+from tests.processes import apart, ended
 from warmprior.io.workers import WorkerError
 
 
-def facts(state):
-    return os.getpid(), os.environ["OMP_NUM_THREADS"], state
+def number(state):
+    return os.getpid()
 
 
 def remember(number, state):
@@ -51,15 +51,16 @@ def sleepers(folder, count):
     return [int(path.name) for path in folder.iterdir()]
 
 
-def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_all(tmp_path):
+@apart
+def test_every_process_has_a_state_of_its_own_and_an_error_ends_all(tmp_path, forked_workers):
     state = []
     with raises(FloatingPointError, "the loss became nan"), working(2, state) as call:
         found = [call(partial(remember, i)).result() for i in range(6)]
-        pid, threads, _ = call(facts).result()
+        pid = call(number).result()
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)
         call(fail).result()
-    assert state == [] and threads == "1" and os.getpid() != pid
+    assert state == [] and os.getpid() != pid
     for process in {pid for pid, _ in found}:
         seen = [numbers for pid, numbers in found if pid == process]
         assert all(numbers == seen[-1][: len(numbers)] for numbers in seen)
@@ -67,7 +68,8 @@ def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_a
     wait_for(lambda: all(map(ended, [pid, *pids])), 20)
 
 
-def test_a_dead_process_ends_all_others(tmp_path):
+@apart
+def test_a_dead_process_ends_all_others(tmp_path, forked_workers):
     with raises(WorkerError, 2, "memory") as raised, working(2, None) as call:
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)

@@ -15,6 +15,7 @@ import h5py
 
 from lab import render as render_module
 from lab.render import render_demonstrations
+from tests.data.synthetic import shortened
 from tests.errors import missing, raises
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
@@ -42,24 +43,7 @@ def render(*args, **options):
 def recorded(lift_demonstrations, tmp_path_factory):
     """Two scripted demos of lift, cut to a few steps."""
     path = tmp_path_factory.mktemp("recorded") / "lift.hdf5"
-    shutil.copy(lift_demonstrations, path)
-    with h5py.File(path, "a") as file:
-        del file["data/demo_2"]
-        file["data"].attrs["total"] = 2 * STEPS
-        for name, names in list(file["mask"].items()):
-            kept = [demo for demo in names[()] if demo != b"demo_2"]
-            del file["mask"][name]
-            file["mask"][name] = np.array(kept, dtype="S8")
-        for demo in file["data"].values():
-            demo.attrs["num_samples"] = STEPS
-            demo.pop("next_obs", None)
-            for group in (demo, demo["obs"]):
-                for name, rows in list(group.items()):
-                    if isinstance(rows, h5py.Dataset):
-                        kept = rows[:STEPS]
-                        del group[name]
-                        group[name] = kept
-    return path
+    return shortened(lift_demonstrations, path, STEPS)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,9 @@
 """Small policies of the plugin, with their observations and batches."""
 
 from functools import partial
+from importlib.util import find_spec
 
+import pytest
 import torch
 
 from tests.lerobot.tiny import (
@@ -16,6 +18,9 @@ from tests.lerobot.tiny import (
 )
 from tests.toy_env import stirred
 
+NEEDS_PLUGIN = pytest.mark.skipif(
+    find_spec("lerobot_policy_warmprior") is None, reason="needs lerobot_policy_warmprior"
+)
 VLA = ["warm_smolvla", "warm_pi05", "warm_groot"]
 
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from tests.errors import raises
-from tests.lerobot.plugin_policies import VLA, flow_batch, flow_policy, small, warm
+from tests.lerobot.plugin_policies import NEEDS_PLUGIN, VLA, flow_batch, flow_policy, small, warm
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
 
-pytest.importorskip("lerobot_policy_warmprior")
+pytestmark = NEEDS_PLUGIN
 
 
 @pytest.mark.parametrize("name", VLA)

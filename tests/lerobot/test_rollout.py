@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from lerobot.policies.rtc import ActionQueue, RTCConfig
-from lerobot.rollout.inference.rtc import _normalize_prev_actions_length, supports_rtc_inference
 
 from tests.errors import raises
 from tests.lerobot.plugin_policies import VLA, warm
@@ -15,6 +13,9 @@ def rollout(policy, family, plan, horizon):
 
     Returns what was executed before every decision, with the history that its source was made from.
     """
+    from lerobot.policies.rtc import ActionQueue, RTCConfig
+    from lerobot.rollout.inference.rtc import _normalize_prev_actions_length, supports_rtc_inference
+
     policy.config.rtc_config = RTCConfig(execution_horizon=horizon)
     if hasattr(policy, "init_rtc_processor"):
         policy.init_rtc_processor()
@@ -65,6 +66,8 @@ def test_what_was_executed_is_counted_by_what_is_left(found, name, prior):
 
 
 def test_what_is_left_over_must_be_of_the_last_chunk(found):
+    from lerobot.policies.rtc import RTCConfig
+
     policy = warm(found, "warm_pi05", prior="past", n_action_steps=LENGTH).eval()
     policy.reset()
     batch = observations("pi05", 2)

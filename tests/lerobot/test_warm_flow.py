@@ -4,16 +4,14 @@ from tensordict import TensorDict
 
 from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.errors import raises
-from tests.lerobot.plugin_policies import flow_batch, flow_policy, one_observation
+from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
 from warmprior import HistoryObservation, Normalizer, PastPrior, RealTimeChunking, VelocityMLP, keys
 from warmprior.data import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
 
-pytest.importorskip("lerobot_policy_warmprior")
-
-from lerobot.configs.types import NormalizationMode
+pytestmark = NEEDS_PLUGIN
 
 STATE, OBJECT = 9, 10  # of lift
 
@@ -207,11 +205,11 @@ def test_the_flow_policy_remembers(found):
     assert torch.equal(sources[5], torch.cat([chunks[0][:, 2:], chunks[1][:, :2]], 1))
 
 
-STANDARDISED = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}
-
-
 def test_the_flow_policy_sees_images(found, tmp_path):
     """Resized, in a random window in training and the central one else; saved and loaded with its encoder."""
+    from lerobot.configs.types import NormalizationMode
+
+    standardised = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}
     policy = flow_policy(found, images=(3, 16, 16), precondition=False)
     batch = flow_batch(8)
     pictures = torch.randint(256, (3, 2, 3, 16, 16), generator=torch.Generator().manual_seed(1))
@@ -242,7 +240,7 @@ def test_the_flow_policy_sees_images(found, tmp_path):
     assert actions[0].shape == (2, 2) and torch.equal(*actions)
     with raises(KeyError, "images.top"):
         policy.select_action(start)
-    for options, fact in (({"encoder": "tiny"}, "resnet18-imagenet"), (STANDARDISED, "MEAN_STD")):
+    for options, fact in (({"encoder": "tiny"}, "resnet18-imagenet"), (standardised, "MEAN_STD")):
         with raises(ValueError, fact):
             flow_policy(found, images=(3, 16, 16), **options)
     with raises(ValueError, "[3, h, w]", "observation.images.top", "[1, 16"):
