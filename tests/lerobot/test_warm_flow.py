@@ -6,7 +6,15 @@ from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.errors import raises
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
-from warmprior import HistoryObservation, Normalizer, PastPrior, RealTimeChunking, VelocityMLP, keys
+from warmprior import (
+    HistoryObservation,
+    Normalizer,
+    PastPrior,
+    RealTimeChunking,
+    RestingJoints,
+    VelocityMLP,
+    keys,
+)
 from warmprior.data import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
@@ -210,7 +218,7 @@ def test_the_flow_policy_sees_images(found, tmp_path):
     from lerobot.configs.types import NormalizationMode
 
     standardised = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}
-    policy = flow_policy(found, images=(3, 16, 16), precondition=False)
+    policy = flow_policy(found, images=(3, 16, 16), precondition=False, prior="past")
     batch = flow_batch(8)
     pictures = torch.randint(256, (3, 2, 3, 16, 16), generator=torch.Generator().manual_seed(1))
     batch["observation.images.top"] = pictures / 255
@@ -333,3 +341,57 @@ def test_the_environment_has_the_observations_of_converted_demonstrations():
     batch.close()
     with raises(ValueError, "task", "'life'"):
         RobosuiteEnvConfig(task="life")
+
+
+JOINTS = ["pan", "lift", "gripper"]
+
+
+def joint_dataset(root, names=JOINTS, near=True):
+    """Episodes whose actions are the joints that the state reads, or other numbers of the same names."""
+    state = numbers(3) | {"names": list(JOINTS)}
+    features = {"observation.state": state, "action": numbers(3) | {"names": list(names)}}
+    return write_lerobot(root, (12, 12, 12), features, same=["action"] if near else [])
+
+
+def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, tmp_path):
+    """The trend is that of this library for the same steps; with it a policy is saved and loaded."""
+    values = joint_dataset(tmp_path / "data")
+    policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, prior="past")
+    assert policy.config.joint_key == "observation.state"
+    low, high = (torch.as_tensor(values["action"]).float().aminmax(dim=0)[i] for i in (0, 1))
+    scaled = 2 * (torch.as_tensor(values["action"]).float() - low) / (high - low) - 1
+    steps = {"observation": scaled, "action": scaled, "episode": torch.arange(36) // 12}
+    sizes = (3, 3, 4, policy.config.n_obs_steps)
+    ends = ({"observation": end, "action": end} for end in (low, high))
+    rest = RestingJoints([0, 1, 2], Normalizer(*ends))
+    by_hand = precondition(VelocityMLP(*sizes), TensorDict(steps, [36]), PastPrior(4), rest=rest)
+    torch.testing.assert_close(policy.actor.network.trend.state_dict(), by_hand.trend.state_dict())
+    stirred(policy.actor.network).train()
+    policy.save_pretrained(tmp_path / "policy")
+    again = found["warm_flow"].from_pretrained(tmp_path / "policy")
+    assert again.config.joint_key == "observation.state"
+    batch = {"observation.state": torch.randn(2, 3)}
+    chunks = []
+    for one in (policy, again):
+        torch.manual_seed(0)
+        one.reset()
+        chunks.append(one.predict_action_chunk(dict(batch)))
+    assert torch.equal(*chunks)
+
+
+@pytest.mark.parametrize(("names", "near"), [(["x", "y", "z"], True), (JOINTS, False)])
+def test_other_actions_are_no_joint_targets(found, tmp_path, names, near):
+    joint_dataset(tmp_path / "data", names, near)
+    policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4)
+    assert policy.config.joint_key == "" and policy.actor.network.trend is None
+    asked = {"joint_key": "observation.state"}
+    if near:  # the names are only how they are recognised
+        policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, **asked)
+        assert policy.actor.network.trend is not None
+        return
+    with raises(ValueError, "observation.state", "joint_key="):
+        dataset_policy(found, tmp_path / "data", **asked)
+    with raises(ValueError, "joint_key", "observation.state", "'wrist'"):
+        dataset_policy(found, tmp_path / "data", joint_key="wrist")
+    with raises(ValueError, "precondition=true"):
+        dataset_policy(found, tmp_path / "data", precondition=False, **asked)

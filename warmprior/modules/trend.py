@@ -22,6 +22,9 @@ DRAWS = 16
 VARIANCE_FLOOR = 1e-4
 """0.01 squared: dimensions that deviate by less than half a percent of their range count as constant."""
 
+NEAR = 0.2
+"""The largest distance of actions from the observed joints they set, as a share of the actions' variance."""
+
 _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
 
 
@@ -131,6 +134,19 @@ class RestingJoints(RestingAction):
         """Return the resting action ``[*B, d_a]``."""
         joints = observation[..., self.columns] * self.scale + self.loc
         return torch.where(self.columns >= 0, (joints - self.action_loc) / self.action_scale, 0.0)
+
+    def farthest(self, observation: Tensor, action: Tensor) -> int | None:
+        """Return the action farthest from the number it should set, or ``None`` if they are near it.
+
+        Observations and actions are normalised, ``[N, d_o]`` and ``[N, d_a]``.
+        """
+        # All targets together: joints may sag below their targets, and one may move less than its noise.
+        targets = self.columns >= 0
+        off = (action - self(observation)).var(0, correction=0)[targets]
+        spread = action.var(0, correction=0)[targets]
+        if off.sum() <= NEAR * spread.sum():
+            return None
+        return int(targets.nonzero()[(off / spread.clamp_min(VARIANCE_FLOOR)).argmax()])
 
 
 class PoseTrend(nn.Module):

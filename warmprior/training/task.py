@@ -22,14 +22,11 @@ from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
-from warmprior.modules.trend import VARIANCE_FLOOR, RestingAction, RestingJoints
+from warmprior.modules.trend import RestingAction, RestingJoints
 from warmprior.training.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
-
-NEAR = 0.2
-"""The largest distance of actions from the observed joints they set, as a share of the actions' variance."""
 
 
 @dataclass(frozen=True)
@@ -327,12 +324,8 @@ class Task:
                 f"{columns}"
             )
         rest = RestingJoints(torch.tensor(columns), self.normalizer)
-        # All targets together: joints may sag below their targets, and one may move less than its noise.
-        targets = torch.tensor([column >= 0 for column in columns])
-        off = (actions - rest(self.vector)).var(0, correction=0)[targets]
-        spread = actions.var(0, correction=0)[targets]
-        if off.sum() > NEAR * spread.sum():
-            worst = int(targets.nonzero()[(off / spread.clamp_min(VARIANCE_FLOOR)).argmax()])
+        worst = rest.farthest(self.vector, actions)
+        if worst is not None:
             raise ValueError(
                 f"actions of {self.name} are not near the observed numbers they should set, least of all "
                 f"action {worst} (number {columns[worst]} of the observation): use the same order and units"

@@ -12,7 +12,7 @@ from lerobot.optim.schedulers import LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
+from lerobot_policy_warmprior.configuration_warm_vla import DEFAULT_PRIOR, OWN_PRIORS
 from warmprior import Prior
 from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
@@ -50,6 +50,9 @@ class WarmFlowConfig(PreTrainedConfig):
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
         precondition: precondition the network by the moments of source and data, see PreconditionedNetwork.
+        joint_key: the observation whose numbers absolute actions set, such as ``observation.state``; empty if
+            there is none. By default ``auto``: ``observation.state`` if the dataset gives it the names of the
+            actions, and the numbers are near. Training replaces ``auto`` by what it found.
         ema_rate: decay of the averaged weights, which are used at decisions.
         network: configuration of another velocity network, as JSON (``VelocityNetwork.config()``).
         embedding_dim: width of the transformer.
@@ -65,10 +68,11 @@ class WarmFlowConfig(PreTrainedConfig):
     n_obs_steps: int = 2
     n_action_steps: int = 8
     prior_chunk: int | None = None
-    prior: str = "past"
+    prior: str = DEFAULT_PRIOR
     cold_probability: float = 0.0
     nfe: int = DEFAULT_NFE
     precondition: bool = True
+    joint_key: str = "auto"
     ema_rate: float = 0.995
     network: str = ""
     embedding_dim: int = 384
@@ -104,9 +108,10 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""
-        names = "n_obs_steps precondition network embedding_dim num_layers num_heads image_size crop_size"
+        names = ["n_obs_steps", "precondition", "joint_key", "network", "embedding_dim", "num_layers"]
+        names += ["num_heads", "image_size", "crop_size", "normalization_mapping"]
         return {
-            **{name: getattr(self, name) for name in (*names.split(), "normalization_mapping")},
+            **{name: getattr(self, name) for name in names},
             "input_features": [*self.observed, *self.image_features],
             "encoder": self.encoder.partition("-")[0],
             "prior": None if training else self.make_prior().config(),
@@ -118,6 +123,14 @@ class WarmFlowConfig(PreTrainedConfig):
         features = self.input_features.items()
         kinds = (FeatureType.ENV, FeatureType.STATE)
         return [name for kind in kinds for name, entry in features if entry.type is kind]
+
+    def joint_columns(self, key: str) -> list[int]:
+        """Return for each action the column of the observation, within ``key``, that it sets, or -1."""
+        if key not in self.observed:
+            raise ValueError(f"--policy.joint_key must be one of {', '.join(self.observed)}, got {key!r}")
+        widths = [self.input_features[name].shape[0] for name in self.observed]
+        first, width = sum(widths[: self.observed.index(key)]), widths[self.observed.index(key)]
+        return [first + i if i < width else -1 for i in range(self.action_feature.shape[0])]
 
     def validate_features(self) -> None:
         """Raise ValueError for a dataset that the policy cannot learn from."""
@@ -140,6 +153,10 @@ class WarmFlowConfig(PreTrainedConfig):
             raise ValueError("warm_flow needs observation.state or observation.environment_state: add one")
         if self.action_feature is None:
             raise ValueError("warm_flow needs the feature 'action': add it to the dataset")
+        if self.joint_key not in ("", "auto"):
+            self.joint_columns(self.joint_key)
+            if not self.precondition:
+                raise ValueError("--policy.joint_key needs --policy.precondition=true")
         check_between(1, self.make_prior().chunk_length, n_action_steps=self.n_action_steps)
 
     def get_optimizer_preset(self) -> AdamWConfig:

@@ -14,6 +14,9 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
 
+DEFAULT_PRIOR = "past,correlation=0.5"
+"""The default of this library's command line too."""
+
 OWN_PRIORS = (
     "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and with --policy.path by "
     "--env.discover_packages_path=PACKAGE"
@@ -34,7 +37,7 @@ class WarmConfigMixin:
         cold_probability: share of the training windows whose history is withheld.
     """
 
-    prior: str = "past"
+    prior: str = DEFAULT_PRIOR
     prior_chunk: int | None = None
     sigma_unit: str = "model"
     action_std: list[float] | None = None

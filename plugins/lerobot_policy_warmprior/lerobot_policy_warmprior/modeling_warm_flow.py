@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Literal, cast
@@ -14,7 +15,7 @@ from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
 from lerobot.processor import NormalizerProcessorStep, TransitionKey
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
@@ -24,8 +25,11 @@ from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
     ImageEncoder,
+    Normalizer,
+    PoseTrend,
     PreconditionedNetwork,
     Prior,
+    RestingJoints,
     VelocityNetwork,
     VisionNetwork,
     WarmPriorActor,
@@ -40,6 +44,9 @@ from warmprior.lerobot.memory import ActionMemory
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition
+
+STATE = "observation.state"
+"""LeRobot's name of a robot's joints."""
 
 
 def training_episodes(meta: Any) -> list[int] | None:
@@ -151,7 +158,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
         # A saved policy's moments are those of other data with another normalisation.
-        fitted = {n: v for n, v in self.state_dict().items() if ".moments." in n}
+        fitted = {n: v for n, v in self.state_dict().items() if ".moments." in n or ".trend." in n}
         self.__dict__["_fitted"] = {} if dataset_meta is None else {n: v.clone() for n, v in fitted.items()}
         # The loss shares the actor's weights; outside of the module it is not saved a second time.
         self.__dict__["_loss_of_actor"] = None
@@ -161,8 +168,12 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         self, network: VelocityNetwork, prior: Prior, dataset_meta: Any
     ) -> PreconditionedNetwork:
         """Precondition the network by the moments of source and data; a saved policy's are in its file."""
+        key, trend = self.config.joint_key, None
         if dataset_meta is None:
-            return PreconditionedNetwork(network)
+            if key not in ("", "auto"):
+                resting = RestingJoints(self.config.joint_columns(key))
+                trend = PoseTrend.zero(resting.config(), prior.prediction_length)
+            return PreconditionedNetwork(network, trend=trend)
         mode = self.config.normalization_mapping.get("ACTION")
         if mode != NormalizationMode.MIN_MAX:
             raise ValueError(
@@ -178,10 +189,50 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         chosen: Any = {"observation_keys": self.config.observed, "episodes": episodes}
         steps = LeRobotDemonstrations(dataset_meta.root, **chosen).data.copy()
         # LeRobot's own step, because it maps a constant dimension to -1.
-        features = {keys.ACTION: self.config.action_feature}
-        norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
-        steps[keys.ACTION] = norm({TransitionKey.ACTION: steps[keys.ACTION]})[TransitionKey.ACTION]
-        return precondition(network, steps, prior, withhold=self.config.cold_probability)
+        names = (*self.config.observed, keys.ACTION)
+        features = {**self.config.input_features, **self.config.output_features}
+        modes = {FeatureType[kind]: mode for kind, mode in self.config.normalization_mapping.items()}
+        norm = NormalizerProcessorStep(
+            {name: features[name] for name in names}, modes, stats=dataset_meta.stats
+        )
+        parts = steps[keys.OBSERVATION].split([self._widths[name] for name in self.config.observed], -1)
+        observed = dict(zip(self.config.observed, parts, strict=True))
+        normalised = norm({TransitionKey.OBSERVATION: observed, TransitionKey.ACTION: steps[keys.ACTION]})
+        steps[keys.ACTION] = normalised[TransitionKey.ACTION]
+        vectors = [normalised[TransitionKey.OBSERVATION][name] for name in self.config.observed]
+        steps[keys.OBSERVATION] = torch.cat(vectors, -1)
+        rest = self._resting_joints(steps, dataset_meta)
+        return precondition(network, steps, prior, withhold=self.config.cold_probability, rest=rest)
+
+    def _resting_joints(self, steps: TensorDictBase, dataset_meta: Any) -> RestingJoints | None:
+        """Return the resting action of absolute joint targets, and write their key into the configuration."""
+        config, asked = self.config, self.config.joint_key
+        key = asked
+        if asked == "auto":
+            names = [dataset_meta.features.get(name, {}).get("names") for name in (STATE, keys.ACTION)]
+            same = names[0] is not None and names[0] == names[1]
+            key = STATE if same and STATE in config.observed else ""
+        if key:
+            ends = []
+            for end in ("min", "max"):
+                numbers = {
+                    n: torch.as_tensor(dataset_meta.stats[n][end]).float().flatten() for n in self._widths
+                }
+                vector = torch.cat([numbers[name] for name in config.observed])
+                ends.append({keys.OBSERVATION: vector, keys.ACTION: numbers[keys.ACTION]})
+            rest = RestingJoints(torch.tensor(config.joint_columns(key)), Normalizer(*ends))
+            worst = rest.farthest(steps[keys.OBSERVATION], steps[keys.ACTION])
+            if worst is None:
+                config.joint_key = key
+                logging.info("the actions are absolute targets of %s: joint_key=%s", key, key)
+                return rest
+            if asked != "auto":
+                raise ValueError(
+                    f"the actions are not near {key}, which they should set, least of all action {worst}: "
+                    "use the same order and units, or --policy.joint_key="
+                )
+        config.joint_key = ""
+        return None
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and keep moments that were fitted to the training data."""
