@@ -77,3 +77,18 @@ def test_commands_have_the_options_that_pages_show(page, capsys):
                 known[command] = _options(command, capsys)
             options = {word.split("=")[0] for word in words if word.startswith("--")}
             assert options <= known[command], f"{page.name}: {command}{rest}"
+
+
+def prose(text: str) -> str:
+    """Return a page without blocks, tables, code, pictures, and the addresses of links."""
+    text = re.sub(r"```.*?```|<!--.*?-->", "", text, flags=re.S)
+    text = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("|"))
+    return re.sub(r"`[^`]*`|!\[.*?\]\(.*?\)|\]\([^)]*\)", " ", text, flags=re.S)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda page: page.name)
+def test_numbers_stand_in_tables(page):
+    """Conclusions are sentences: of a hundred words outside of tables at most ten are numbers."""
+    text = prose(page.read_text())
+    words, numbers = re.findall(r"[A-Za-z][\w'-]*", text), re.findall(r"(?<![\w.])\d[\d,.]*%?(?!\w)", text)
+    assert len(numbers) <= 0.1 * len(words)
