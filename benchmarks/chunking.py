@@ -18,7 +18,7 @@ from lab.paper import PAPER_CHUNK
 from lab.plots import plot_bars, plot_lines, plot_success
 from lab.policies import policies_of, slug
 from lab.presets import PRESETS
-from lab.report import at_fewest, labelled, per_seed, table, write_report
+from lab.report import at_fewest, counted, labelled, per_seed, table, write_report
 
 JUMPS = ("boundary_jump", "inner_jump")
 
@@ -42,7 +42,7 @@ def main(argv: list[str] | None) -> None:
             plot_lines(seeds_of_setting, out / f"chunk_lengths{end}.png", name, "chunk", lines)
         # All tasks side by side, at the fewest network evaluations.
         fewest, shortest = at_fewest(seeds), min(seeds.chunk)
-        title = f"NFE {min(seeds.nfe)}, {options.evaluation.seeds} seed(s)"
+        title = f"NFE {min(seeds.nfe)}, {counted(options.evaluation.seeds, 'seed')}"
         pair = fewest[fewest.chunk.isin((shortest, PAPER_CHUNK))]
         bars = {"success": "success rate"}
         plot_bars(pair.assign(chunk="H = " + pair.chunk.astype(str)), out / "bars.png", title, "chunk", bars)

@@ -19,7 +19,7 @@ from lab.paper import paper_curvature
 from lab.plots import plot_flow_paths
 from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
 from lab.presets import PRESETS, study
-from lab.report import labelled, pooled, setting_title, table, write_report
+from lab.report import counted, labelled, pooled, setting_title, table, write_report
 from warmprior.diagnostics import encoded_windows, flow_paths
 
 
@@ -69,8 +69,8 @@ def main(argv: list[str] | None) -> None:
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
         seeds = rows.seed.dropna().nunique()
         notes = [
-            f"{setting_title(task)}, {len(observations)} observations of {source}, {seeds} seed(s). In "
-            "brackets: 95% bootstrap intervals over episodes.",
+            f"{setting_title(task)}, {len(observations)} observations of {source}, {counted(seeds, 'seed')}. "
+            "In brackets: 95% bootstrap intervals over episodes.",
             "The paper does not say which mean it uses, nor whether it averages over all 2H positions.",
             "Shorter paths have less curvature. Curvature divided by the squared mean velocity does not "
             "depend on their length.",

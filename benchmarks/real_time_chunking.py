@@ -23,7 +23,7 @@ from lab.options import Options, check_given, check_single
 from lab.plots import plot_bars
 from lab.policies import Cell, policies_of
 from lab.presets import PRESETS, study
-from lab.report import labelled, per_seed, table, write_report
+from lab.report import counted, labelled, per_seed, table, write_report
 from lab.tasks import check_counts
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.transforms.delay import check_delay
@@ -106,7 +106,7 @@ def main(argv: list[str] | None) -> None:
         for nfe, seeds_at_nfe in seeds.groupby("nfe"):
             end = f"_nfe{nfe}.png" if seeds.nfe.nunique() > 1 else ".png"
             actions = seeds_at_nfe.execute.iloc[0]
-            title = f"NFE {nfe}, {actions} actions per decision, {len(options.seeds)} seed(s)"
+            title = f"NFE {nfe}, {actions} actions per decision, {counted(len(options.seeds), 'seed')}"
             bars = seeds_at_nfe.assign(delay="delay " + seeds_at_nfe.delay.astype(str))
             plot_bars(bars, out / f"real_time_chunking{end}", title, "delay", lines)
         rtc_options = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}

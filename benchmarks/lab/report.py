@@ -273,21 +273,21 @@ def _placed(rows: DataFrame) -> DataFrame:
     return rows.assign(text=texts)
 
 
-def _count(number: float, word: str) -> str:
+def counted(number: float, word: str) -> str:
     return f"{number:,.0f} {word}{'' if number == 1 else 's'}"
 
 
 def _experiment(rows: DataFrame, top_k: int) -> str:
     most = rows[["seeds", "checkpoints"]].max()
-    episodes = _count((rows["episodes"] / rows["seeds"]).max(), "episode")
+    episodes = counted((rows["episodes"] / rows["seeds"]).max(), "episode")
     chunks = ", ".join(map(str, rows["chunk"].unique()))
     chosen = f"best {min(top_k, most['checkpoints'])} of {most['checkpoints']} checkpoints per seed"
     chosen = chosen if most["checkpoints"] > 1 else "last checkpoint"
-    return f"H = {chunks}, {_count(most['seeds'], 'seed')} with {episodes} each, {chosen}"
+    return f"H = {chunks}, {counted(most['seeds'], 'seed')} with {episodes} each, {chosen}"
 
 
 def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
-    """Return three sentences: the experiment, the best methods, and whether their gain can be chance.
+    """Return three sentences: what the best methods gain, if it can be chance, and how much they solve.
 
     Over several settings, success is averaged, and trainings are taken together.
     """
@@ -304,12 +304,13 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
             name = others["success"].idxmax()
             gains = [of for of in totals.loc[name, "gains"] if of]
             gain = np.mean([np.mean(of) for of in gains]) if gains else math.nan
-            chances.append(f"{name} {gain:+.1%} at {nfe} ({verdict(*gains)})")
+            more = f"{abs(gain) * 100:.1f} points {'fewer' if gain < 0 else 'more'}"
+            chances.append(f"{name} solves {more} at {nfe} ({verdict(*gains)})")
     where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
     lines = [
-        f"{_count(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
+        f"Compared with the {first}, {', '.join(chances) or 'nothing else was played in all settings'}.",
         f"Best success: {'; '.join(best)}.",
-        f"Gain over {first}: {'; '.join(chances) or 'nothing to compare'}.",
+        f"{counted(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
     ]
     return "\n".join(textwrap.fill(line, width, subsequent_indent="  ") for line in lines)
 
@@ -321,22 +322,22 @@ def verdict(*gains: Sequence[float]) -> str:
     ('p = 0.031, 6 trainings', '1 training, too few to judge')
     """
     trainings = sum(map(len, gains))
-    count = _count(trainings, "training")
+    count = counted(trainings, "training")
     if trainings < ENOUGH_TRAININGS:
         return f"{count}, too few to judge"
     return f"p = {sign_flip_test(*gains):.2g}, {count}"
 
 
 def terminal_table(results: DataFrame, top_k: int, width: int = 120) -> str:
-    """Return the headline, then a line per setting and method with a column per NFE."""
+    """Return the headline, then per setting a line per method with a column per NFE."""
     rows, first = _placed(results), baseline(results)
-    several = rows["place"].nunique() > 1
-    rows["line"] = rows["place"] + ", " + rows["method"] if several else rows["method"]
-    frame = wide(rows, rows["text"], "line", "column").rename_axis(index=None, columns=None)
-    frame.index = [textwrap.shorten(name, width * 2 // 3, placeholder=" ...") for name in frame.index]
+    parts = [headline(results, top_k, width)]
+    for place, group in rows.groupby("place", sort=False):
+        frame = wide(group, group["text"], "method", "column").rename_axis(index=None, columns=None)
+        text = frame.to_string(line_width=width)  # wide tables go on below
+        parts.append(text if rows["place"].nunique() == 1 else f"{place}\n{text}")
     legend = f"Success (%), gain over {first}. **: the best. *: gain above both deviations over seeds."
-    legend = textwrap.shorten(legend, width, placeholder=" ...")
-    return "\n".join([headline(results, top_k, width), "", frame.to_string(line_width=width), "", legend])
+    return "\n\n".join([*parts, textwrap.fill(legend, width)])
 
 
 def success_report(
@@ -369,7 +370,8 @@ def success_report(
             "not numbers across rows."
         )
     keys = [name for name in ("setting", "delay", "nfe", "temperature", "method") if name in results]
-    return f"{markdown(frame, listed)}\n{table(results, keys, SHOWN)}"
+    first_sentence, *_ = headline(results, top_k, width=10_000).splitlines()
+    return f"{first_sentence}\n\n{markdown(frame, listed)}\n{table(results, keys, SHOWN)}"
 
 
 # Options that are not part of the recipe, or are in the first lines of a report.
