@@ -88,8 +88,13 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
         few = {"iterations": 600, "save_every": 20, "checkpoints": 2, "episodes": 2, "prior": "past"}
         argv = [*options(dataset, out, **few), "--no-videos"]
         argv += ["--resume"] if (out / "options.json").exists() else []
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        return subprocess.Popen([sys.executable, robomimic.__file__, *argv], start_new_session=True, **quiet)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with log(out).open("a") as written:
+            pipes = {"stdout": written, "stderr": subprocess.STDOUT, "start_new_session": True}
+            return subprocess.Popen([sys.executable, robomimic.__file__, *argv], **pipes)
+
+    def log(out):
+        return out.parent / "log.txt"
 
     def results(out):
         rows = [row | {"training_seconds": None} for row in stored(out)]
@@ -98,7 +103,7 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
 
     undisturbed = tmp_path / "undisturbed" / "out"
     begun = time.monotonic()
-    assert launch(undisturbed).wait() == 0
+    assert launch(undisturbed).wait() == 0, log(undisturbed).read_text()
     duration = time.monotonic() - begun
     rows, weights = results(undisturbed)
     assert len(rows) == len(weights) == 2
@@ -107,7 +112,8 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(datas
     while True:
         process = launch(out)
         try:
-            assert process.wait(None if kills == 20 else rng.uniform(0.1, 0.9) * duration) == 0
+            code = process.wait(None if kills == 20 else rng.uniform(0.1, 0.9) * duration)
+            assert code == 0, f"after {kills} kills:\n{log(out).read_text()}"
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             assert process.wait() == -signal.SIGKILL
