@@ -62,7 +62,7 @@ def test_optional_packages_are_not_imported_and_a_policy_trains_without_them():
 
 ROOMS = [
     *("io", "modules", "lerobot", "transforms", "objectives", "deploy"),
-    *("envs", "data", "diagnostics", "training", "rl"),
+    *("envs", "data", "diagnostics", "saving", "tasks", "evaluation", "training", "rl"),
 ]
 """Each may import those before it alone."""
 

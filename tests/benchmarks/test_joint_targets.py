@@ -7,7 +7,7 @@ import torch
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
 from warmprior.data import convert_robomimic
-from warmprior.training import Task
+from warmprior.tasks import Task
 
 
 def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):

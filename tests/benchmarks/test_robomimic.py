@@ -19,7 +19,7 @@ from lab.presets import PRESETS
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.processes import apart
 from warmprior.envs import rendering_backend
-from warmprior.training.checkpoint import load_state
+from warmprior.saving.checkpoint import load_state
 
 
 def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypatch):

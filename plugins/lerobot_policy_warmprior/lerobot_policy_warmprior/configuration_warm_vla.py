@@ -11,8 +11,8 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
-from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
+from warmprior.training.option_text import build
 
 OWN_PRIORS = (
     "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and with --policy.path by "
