@@ -12,7 +12,7 @@ from pathlib import Path
 from lab.cards import measured
 from lab.command_line import script
 from lab.report import policy_results
-from warmprior.training import load_policy, model_card
+from warmprior.saving import load_policy, model_card
 
 
 @script("card.py", hint="")

@@ -25,10 +25,10 @@ from lab.presets import PRESETS
 from lab.scripted.episode import Episode, write_robomimic
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
-from warmprior.data.hdf5 import open_robomimic, selected_demos
+from warmprior.data.formats.hdf5 import open_robomimic, selected_demos
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
-from warmprior.training import Task
+from warmprior.tasks import Task
 
 SQUARE, ARM = "square", "robot0_"
 OBSERVATION = ["object", f"{ARM}joint_pos", f"{ARM}gripper_qpos"]

@@ -26,7 +26,7 @@ from lab.tasks import DataOptions
 from warmprior.data import LeRobotDemonstrations
 from warmprior.envs import gym_env
 from warmprior.io.extras import require
-from warmprior.training import Task
+from warmprior.tasks import Task
 
 SIDE = 512.0  # side of the field in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 import warmprior.training
-from lab.couplings import ReflowCoupling
 from tests.data.lerobot_parts import numbers, write_lerobot
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import TOKEN, model_hub
@@ -17,8 +16,9 @@ from tests.lerobot.test_actor import Arm, preprocessed
 from tests.lerobot.tiny import ACTION, CAMERA, STATE, make_smolvla
 from tests.test_blocks import BLOCKS, GIVEN
 from tests.toy_env import Halfway, demonstrations, mlp_actor
-from warmprior import GaussianPrior, Normalizer, PastPrior
-from warmprior.training import TrainingConfig, save_policy
+from warmprior import GaussianPrior, Normalizer, PastPrior, ReflowCoupling
+from warmprior.saving import save_policy
+from warmprior.training import TrainingConfig
 
 pytestmark = NEEDS_PLUGIN
 

@@ -9,12 +9,14 @@ from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
 from warmprior.__main__ import main
-from warmprior.training.saved import load_policy, save_policy
+from warmprior.saving.policies import load_policy, save_policy
 
 pytest.importorskip("robosuite")
 from warmprior.envs import TASKS, rendering_backend
-from warmprior.training import NetworkOptions, Task, TrainingConfig, play_episode, train_policy
-from warmprior.training.behaviour_cloning import policy_path
+from warmprior.evaluation import play_episode
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+from warmprior.training.cloning import policy_path
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
@@ -60,7 +62,7 @@ def test_evaluate_plays_the_same_episodes(saved, capsys):
 
 
 def test_evaluate_plays_without_noise_at_temperature_0(saved, monkeypatch):
-    import warmprior.training.evaluation as evaluation
+    import warmprior.evaluation.episodes as evaluation
 
     played = []
     monkeypatch.setattr(

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import nn
 
-from lab.couplings import ReflowCoupling
 from lab.methods import Method
 from tests.errors import raises
 from tests.toy_env import Halfway, demonstrations
@@ -12,6 +11,7 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     PastPrior,
+    ReflowCoupling,
     Source,
     VelocityMLP,
     WarmPriorActor,

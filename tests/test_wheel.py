@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
-from warmprior.training.saved import FORMAT
+from warmprior.saving.policies import FORMAT
 
 ROOT = Path(__file__).parents[1]
 PLUGIN = ROOT / "plugins" / "lerobot_policy_warmprior"

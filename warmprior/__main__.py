@@ -21,17 +21,19 @@ from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import Sampling
-from warmprior.modules.option_text import make
 from warmprior.modules.prior import Prior
-from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, model_card, train_policy
-from warmprior.training.behaviour_cloning import policy_path
-from warmprior.training.saved import (
+from warmprior.saving import load_policy, model_card
+from warmprior.saving.policies import (
     check_repository,
     policy_config,
     policy_file,
     push_policy,
     save_policy,
 )
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+from warmprior.training.cloning import policy_path
+from warmprior.training.option_text import make
 from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.window import window_transforms
 
@@ -147,8 +149,8 @@ def evaluate(
     """
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
-    from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.video import check_video, record_filmstrip
+    from warmprior.evaluation.episodes import evaluate as play
+    from warmprior.evaluation.video import check_video, record_filmstrip
 
     check_whole_numbers(**{"--episodes": episodes})
     if nfe == ():

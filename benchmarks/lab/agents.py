@@ -20,8 +20,8 @@ from lab.tasks import check_counts
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
+from warmprior.evaluation import parallel_env
 from warmprior.rl import PriorSpaceConfig
-from warmprior.training import parallel_env
 from warmprior.transforms import EncodeObservation
 
 TOY = "navigation"

@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from lab.couplings import OTCoupling
-from warmprior import LinearInterpolant
+from warmprior import LinearInterpolant, OTCoupling
 from warmprior.checks import check_finite_numbers
 from warmprior.modules.interpolant import Interpolant
 
@@ -73,14 +72,14 @@ class BridgeCoupling(OTCoupling):
 
     with uniform marginals (Tong et al., 2024, Prop. 3.4), and the path between them is a Brownian bridge,
     :class:`BridgeInterpolant`, which the loss takes from here. For small ``sigma`` this is
-    :class:`~lab.couplings.OTCoupling`; for large ``sigma`` pairs are independent.
+    :class:`~warmprior.OTCoupling`; for large ``sigma`` pairs are independent.
 
     Args:
         sigma: standard deviation of the Brownian motion at ``t = 1``, > 0, in normalised action units.
-        observation_weight: ``w``, see :class:`~lab.couplings.OTCoupling`.
+        observation_weight: ``w``, see :class:`~warmprior.OTCoupling`.
 
     Raises:
-        ValueError: as :class:`~lab.couplings.OTCoupling`, or if ``sigma`` is not a finite number > 0.
+        ValueError: as :class:`~warmprior.OTCoupling`, or if ``sigma`` is not a finite number > 0.
 
     Examples:
         >>> import torch

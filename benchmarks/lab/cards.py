@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from warmprior.diagnostics import success_posterior
-from warmprior.training.card import code, table
+from warmprior.saving.card import code, table
 
 
 def measured(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return task, facts and success of :func:`~warmprior.training.model_card` from a policy's rows.
+    """Return task, facts and success of :func:`~warmprior.saving.model_card` from a policy's rows.
 
     Examples:
         >>> from lab.cards import measured

@@ -19,9 +19,9 @@ from lab.methods import Method
 from lab.options import Evaluation, Options
 from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
 from lab.rows import PLAYED, read_rows
+from warmprior.evaluation import Episode
 from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic
-from warmprior.training import Episode
 
 EPISODES_PER_JOB = 5  # few keep all cores busy to the end, many load policies less often
 

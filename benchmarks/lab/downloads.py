@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.hdf5 import open_robomimic
+from warmprior.data.formats.hdf5 import open_robomimic
 from warmprior.data.replay import DatasetError
 from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.envs.tasks import TASKS

@@ -28,17 +28,26 @@ from typing import Any
 import torch
 
 from lab.bridge import BridgeCoupling
-from lab.couplings import OTCoupling, ReflowCoupling
 from lab.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
 from lab.mip import SECOND, MIPCoupling, TwoStepCoupling
-from warmprior import CVAEPrior, GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint, WarmPriorActor
+from warmprior import (
+    CVAEPrior,
+    GaussianPrior,
+    OTCoupling,
+    PastPrior,
+    PreviewPrior,
+    Prior,
+    ReflowCoupling,
+    StartPoint,
+    WarmPriorActor,
+)
 from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of, file_digest
-from warmprior.modules.option_text import find, options_of
 from warmprior.modules.prior import Source
 from warmprior.objectives import Coupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
+from warmprior.training.option_text import find, options_of
 
 
 class ColdPrior(GaussianPrior):

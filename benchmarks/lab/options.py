@@ -23,7 +23,7 @@ from lab.tasks import (
     is_simulated,
     without_images,
 )
-from warmprior.data.opening import name_of_place
+from warmprior.data.demonstrations import name_of_place
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import check_batch, launched
 from warmprior.modules.ode import Sampling

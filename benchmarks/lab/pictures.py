@@ -16,7 +16,7 @@ from lab.policies import Policy
 from lab.report import at_fewest, labelled, per_seed
 from lab.tasks import title_of
 from warmprior.envs.rendering import rendering_backend
-from warmprior.training import record_filmstrip
+from warmprior.evaluation import record_filmstrip
 
 
 def tasks_of(policies: Sequence[Policy]) -> dict[tuple[str, str], list[Policy]]:

@@ -32,20 +32,15 @@ from lab.stored_options import of_run, stored_options
 from lab.tasks import DataOptions, load_task, longest_of, space_of, task_places, title_of, without_images
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
+from warmprior.evaluation import Episode, play_episode
 from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.training import (
-    Episode,
-    NetworkOptions,
-    Task,
-    TrainingConfig,
-    load_policy,
-    play_episode,
-    train_policy,
-)
-from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
-from warmprior.training.checkpoint import load_state
+from warmprior.saving import load_policy
+from warmprior.saving.checkpoint import load_state
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+from warmprior.training.cloning import STATE_FORMAT, policy_path
 
 
 @dataclass(frozen=True)

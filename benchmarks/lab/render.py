@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from lab.files import cache_folder
 from lab.workers import available_cores, working
-from warmprior.data.hdf5 import member, open_robomimic, read_index, read_origin, reading
+from warmprior.data.formats.hdf5 import member, open_robomimic, read_index, read_origin, reading
 from warmprior.data.images import StateRenderer, renderer_versions
 from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.rendering import require_rendering

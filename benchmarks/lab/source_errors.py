@@ -77,7 +77,7 @@ def mean_revision(rollout: TensorDictBase) -> float:
     states that the policy reaches than in the demonstrations.
 
     Args:
-        rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.
+        rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.evaluation.Episode`.
 
     Returns:
         Root mean square over warm positions and dimensions, in normalised action units; NaN if none is warm.

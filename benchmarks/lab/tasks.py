@@ -17,9 +17,9 @@ from lab.render import render_demonstrations
 from lab.scripted.generate import generate_demonstrations
 from lab.scripted.tasks import EXPERTS
 from warmprior.checks import check_whole_numbers
+from warmprior.data.demonstrations import LEROBOT, MINARI, dataset_name
+from warmprior.data.formats.lerobot_index import is_remote
 from warmprior.data.images import renderer_versions
-from warmprior.data.lerobot_index import is_remote
-from warmprior.data.opening import LEROBOT, MINARI, dataset_name
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
 from warmprior.envs.rendering import require_rendering
@@ -28,8 +28,9 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
 from warmprior.modules.encoder import imagenet_weights
-from warmprior.training import NetworkOptions, Task
-from warmprior.training.files import image_names, opened, read_steps, task_name
+from warmprior.tasks import Task
+from warmprior.tasks.recorded import image_names, opened, read_steps, task_name
+from warmprior.training import NetworkOptions
 from warmprior.training.options import OF_IMAGES, PRETRAINED
 from warmprior.transforms.absolute_actions import Actions
 

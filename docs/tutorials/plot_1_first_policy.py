@@ -39,7 +39,7 @@ from warmprior.envs import (
     navigation_metrics,
     navigation_positions,
 )
-from warmprior.training import load_policy, save_policy
+from warmprior.saving import load_policy, save_policy
 
 torch.manual_seed(0)
 

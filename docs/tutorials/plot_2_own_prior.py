@@ -25,12 +25,8 @@ from warmprior.envs import (
     navigation_metrics,
     navigation_positions,
 )
-from warmprior.training import (
-    NetworkOptions,
-    Task,
-    TrainingConfig,
-    train_policy,
-)
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 torch.manual_seed(0)
 

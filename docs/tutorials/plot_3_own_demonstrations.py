@@ -34,13 +34,9 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations
-from warmprior.training import (
-    BehaviourCloning,
-    TrainingConfig,
-    evaluate,
-    load_policy,
-    precondition,
-)
+from warmprior.evaluation import evaluate
+from warmprior.saving import load_policy
+from warmprior.training import BehaviourCloning, TrainingConfig, precondition
 
 torch.manual_seed(0)
 folder = tempfile.TemporaryDirectory()
@@ -187,7 +183,7 @@ policies = {
 # %%
 # Evaluating
 # ----------
-# :func:`~warmprior.training.evaluate` plays the episodes of given seeds, the same ones for every
+# :func:`~warmprior.evaluation.evaluate` plays the episodes of given seeds, the same ones for every
 # policy. It needs one entry that Gymnasium's pendulum lacks: ``"success"``. A small transform adds
 # it: the pendulum stands when the time is over. It also keeps the observations, for the video below;
 # transforms before :func:`~warmprior.policy_transforms` see every
@@ -271,7 +267,7 @@ plt.show()
 # A video
 # -------
 # One episode of WP-Past, from a start that no demonstration has. (Tasks of robosuite have
-# :func:`~warmprior.training.record_filmstrip`, which renders the simulator; for an environment of your
+# :func:`~warmprior.evaluation.record_filmstrip`, which renders the simulator; for an environment of your
 # own, draw its observations.)
 
 

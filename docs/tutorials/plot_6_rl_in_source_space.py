@@ -41,7 +41,7 @@ from warmprior.envs import (
     navigation_heights,
     navigation_positions,
 )
-from warmprior.training import evaluate
+from warmprior.evaluation import evaluate
 
 torch.manual_seed(0)
 demos = navigation_demonstrations()
@@ -93,7 +93,7 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 # the wrong side. An agent needs one more transform than usual:
 # :class:`~warmprior.PriorAnchor` writes the point around which the agent acts.
 #
-# :func:`~warmprior.training.evaluate` plays the same episodes with any policy, frozen ones and
+# :func:`~warmprior.evaluation.evaluate` plays the same episodes with any policy, frozen ones and
 # agents alike.
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 
-from warmprior.training import load_policy
+from warmprior.saving import load_policy
 
 torch.manual_seed(0)
 
@@ -70,7 +70,7 @@ for path in sorted(policies.glob("*/state*")):
 # -------------------------------
 # Here is one seed again, elsewhere, in a single worker. If the number of workers mattered, the
 # weights would differ in the last bits, and so would the policies' actions.
-# :func:`~warmprior.training.load_policy` reads both.
+# :func:`~warmprior.saving.load_policy` reads both.
 
 alone, _ = compare("alone/run", seeds=1, envs=1)
 print("the same rows:", alone == [row for row in more if row["seed"] == 0])

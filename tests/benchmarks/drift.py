@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from tests.benchmarks.script_parts import command_line
 from tests.toy_env import CountingEnv
 from warmprior import PastPrior
-from warmprior.training import Task
+from warmprior.tasks import Task
 
 H, OBSERVATION_DIM, ACTION_DIM = 4, 19, 7
 

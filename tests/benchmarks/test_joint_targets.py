@@ -9,7 +9,7 @@ from lab.tasks import DataOptions
 from tests.processes import here
 from warmprior.data import convert_robomimic
 from warmprior.envs.tasks import TaskSpec
-from warmprior.training import Task
+from warmprior.tasks import Task
 
 
 def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):

@@ -4,10 +4,9 @@ import pickle
 import torch
 
 from lab.bridge import BridgeCoupling
-from lab.couplings import OTCoupling, ReflowCoupling
 from lab.methods import METHODS, Method
 from tests.errors import raises
-from warmprior import VelocityMLP, WarmPriorActor
+from warmprior import OTCoupling, ReflowCoupling, VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
 from warmprior.training import TrainingConfig
 

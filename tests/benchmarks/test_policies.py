@@ -22,8 +22,8 @@ from tests.together import together
 from warmprior import RealTimeChunking, policy_transforms
 from warmprior.diagnostics import smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.evaluation import play_episode
 from warmprior.io.distributed import rank, world_size
-from warmprior.training import play_episode
 
 
 def untimed(out):

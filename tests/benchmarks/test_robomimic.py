@@ -20,7 +20,7 @@ from tests.benchmarks.script_parts import command_line, described, is_png, optio
 from tests.processes import apart
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.training.checkpoint import load_state
+from warmprior.saving.checkpoint import load_state
 
 
 def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypatch):

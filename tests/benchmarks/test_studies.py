@@ -21,7 +21,8 @@ from tests.benchmarks.script_parts import command_line, described, is_png, optio
 from tests.data.synthetic import write_robomimic_file
 from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import SharedObservations, action_error
-from warmprior.training import Task, load_policy
+from warmprior.saving import load_policy
+from warmprior.tasks import Task
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 

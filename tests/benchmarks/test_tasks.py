@@ -20,8 +20,8 @@ from warmprior.data import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.training import load_policy
-from warmprior.training.checkpoint import load_state
+from warmprior.saving import load_policy
+from warmprior.saving.checkpoint import load_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 

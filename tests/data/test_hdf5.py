@@ -9,12 +9,12 @@ import torch
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import raises
 from warmprior.data import RobomimicDemonstrations
-from warmprior.data.hdf5 import RobomimicReader, read_index
+from warmprior.data.formats.hdf5 import RobomimicReader, read_index
 from warmprior.data.replay import DatasetError
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr("warmprior.data.hdf5.BLOCK", 7)
+    monkeypatch.setattr("warmprior.data.formats.hdf5.BLOCK", 7)
     path = tmp_path / "file.hdf5"
     (demo,) = write_robomimic_file(path, lengths=(40,))
     with h5py.File(path) as file:

@@ -13,7 +13,7 @@ import pytest
 from tests.data.hdf5_faults import FAULTS, replace
 from tests.errors import raises
 from warmprior.data import DatasetError, RobomimicDemonstrations
-from warmprior.data.hdf5 import read_index
+from warmprior.data.formats.hdf5 import read_index
 
 
 def replaced(name, value):
@@ -178,7 +178,9 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    monkeypatch.setattr("warmprior.data.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled"))
+    monkeypatch.setattr(
+        "warmprior.data.formats.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled")
+    )
     with raises(OSError, "GB", "scratch_dir"):
         RobomimicDemonstrations(path, **options)
     gc.collect()

@@ -10,8 +10,8 @@ from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import LeRobotDemonstrations
-from warmprior.data.lerobot_index import action_names, read_lerobot_index, state_names
-from warmprior.data.opening import Demonstrations
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.lerobot_index import action_names, read_lerobot_index, state_names
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3

@@ -11,7 +11,7 @@ from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from tests.errors import raises
 from warmprior.data import DatasetError, LeRobotDemonstrations
-from warmprior.data.lerobot_index import read_lerobot_index
+from warmprior.data.formats.lerobot_index import read_lerobot_index
 
 LIFT = env_args_15("lift")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -165,7 +165,7 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
     change, said, *keys = (META | VALUES | IMAGES)[name]
     change(root)
     if name in META:
-        monkeypatch.setattr("warmprior.data.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
+        monkeypatch.setattr("warmprior.data.formats.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
     with raises(DatasetError, root / DATA if name in VALUES else root, *said):
         LeRobotDemonstrations(root, env_args=LIFT, image_keys=keys)
 

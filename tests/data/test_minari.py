@@ -16,9 +16,11 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 from warmprior import PastPrior  # noqa: E402
 from warmprior.__main__ import main  # noqa: E402
 from warmprior.data import DatasetError, MinariDemonstrations  # noqa: E402
-from warmprior.data.opening import Demonstrations  # noqa: E402
+from warmprior.data.demonstrations import Demonstrations  # noqa: E402
 from warmprior.envs import environment_of  # noqa: E402
-from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, train_policy  # noqa: E402
+from warmprior.saving import load_policy  # noqa: E402
+from warmprior.tasks import Task  # noqa: E402
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy  # noqa: E402
 
 LENGTHS = (7, 12, 5)
 VECTOR = Box(-np.inf, np.inf, (3,), np.float64)

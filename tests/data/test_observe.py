@@ -14,7 +14,7 @@ pytest.importorskip("robosuite")
 
 from warmprior.__main__ import main  # noqa: E402
 from warmprior.data import DatasetError, RobomimicDemonstrations, observe_recordings  # noqa: E402
-from warmprior.training import Task  # noqa: E402
+from warmprior.tasks import Task  # noqa: E402
 
 
 @pytest.fixture

@@ -22,7 +22,8 @@ from warmprior.__main__ import main
 from warmprior.deploy import AsyncExecutor, export_policy, load_exported
 from warmprior.envs import navigation_demonstrations
 from warmprior.history import advance, cold_history
-from warmprior.training import NetworkOptions, TrainingConfig, save_policy, train_policy
+from warmprior.saving import save_policy
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 D_O, D_A = 3, 2
 

@@ -13,7 +13,7 @@ from warmprior.data import RobomimicDemonstrations
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
 from warmprior.envs.description import environment_name, robosuite_parts
 from warmprior.envs.simulator import task_env_args
-from warmprior.training.saved import load_policy, save_policy
+from warmprior.saving.policies import load_policy, save_policy
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 

@@ -39,8 +39,8 @@ from warmprior import (
 from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
 from warmprior.envs import modernize_env_args
 from warmprior.history import cold_history
-from warmprior.training.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
-from warmprior.training.saved import load_policy, policy_config, save_policy
+from warmprior.saving.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
+from warmprior.saving.policies import load_policy, policy_config, save_policy
 
 Case = tuple[str, Callable[[], Outcome], str]
 """How a file was damaged, the load to attempt, and what its error has to name."""

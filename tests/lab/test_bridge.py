@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from lab.bridge import BridgeCoupling, BridgeInterpolant
-from lab.couplings import OTCoupling
 from tests.errors import raises
 from tests.objectives.test_flow_matching import actor_for
-from warmprior import FlowMatchingLoss, GaussianPrior
+from warmprior import FlowMatchingLoss, GaussianPrior, OTCoupling
 
 pytest.importorskip("scipy")
 

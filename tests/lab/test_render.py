@@ -21,8 +21,8 @@ from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, RobomimicDemonstrations
+from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.images import check_images
-from warmprior.data.opening import Demonstrations
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

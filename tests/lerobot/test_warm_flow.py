@@ -260,7 +260,7 @@ def saved_policy(folder, **options):
     from warmprior import VelocityMLP, WarmPriorActor
     from warmprior.envs.description import environment_description
     from warmprior.envs.simulator import task_env_args
-    from warmprior.training import save_policy
+    from warmprior.saving import save_policy
 
     torch.manual_seed(0)
     data = torch.rand(2, 50, OBJECT + STATE), torch.rand(2, 50, 7)

@@ -18,7 +18,7 @@ from warmprior import (
     window_replay_buffer,
 )
 from warmprior.modules.encoder import load_imagenet
-from warmprior.training.saved import load_policy, save_policy
+from warmprior.saving.policies import load_policy, save_policy
 
 CAMERAS = ("agentview_image", "robot0_eye_in_hand_image")
 SIZE, CROP, STATE = 12, 8, 3

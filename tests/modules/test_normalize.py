@@ -9,7 +9,14 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
 from tests.toy_env import CountingEnv
-from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior import (
+    Normalizer,
+    PastPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    normalizing_transforms,
+    policy_transforms,
+)
 from warmprior.envs import NavigationEnv
 
 
@@ -60,7 +67,7 @@ def test_whole_numbers_and_flags_become_floats_in_a_batch_too(dtype):
     normalizer = Normalizer({"observation": torch.zeros(2)}, {"observation": torch.full((2,), 9.0)})
 
     def make():
-        return TransformedEnv(Whole(dtype), Compose(*normalizer.env_transforms()))
+        return TransformedEnv(Whole(dtype), Compose(*normalizing_transforms(normalizer)))
 
     raw = Whole(dtype).rollout(3)
     expected = normalizer.normalize(raw)["observation"]
@@ -89,11 +96,11 @@ def test_errors():
         with raises(ValueError, "state", "observation"):
             ends("state")
     with raises(ValueError, "observation", "[9]", "[4]"):
-        TransformedEnv(NavigationEnv(), fitted.env_transforms()[0]).observation_spec  # noqa: B018
+        TransformedEnv(NavigationEnv(), normalizing_transforms(fitted)[0]).observation_spec  # noqa: B018
     for key in ("state", ("agent", "state")):  # an entry that the environment lacks would stay as it is
         other = Normalizer({key: torch.zeros(4)}, {key: torch.ones(4)})
         with raises(KeyError, str(key), "observation", "rename"):
-            TransformedEnv(CountingEnv(5), *other.env_transforms()).reset()
+            TransformedEnv(CountingEnv(5), *normalizing_transforms(other)).reset()
     one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
     with raises(ValueError, "a", "[2]", "[3]"):
         Normalizer(one, two)

@@ -7,10 +7,10 @@ import torch
 from tests.errors import raises
 from tests.toy_env import Learned, demonstrations, mlp_actor, random_history
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder
-from warmprior.modules.option_text import find, make, options_of
 from warmprior.modules.registry import from_config
+from warmprior.saving.policies import load_policy
 from warmprior.training import BehaviourCloning, TrainingConfig
-from warmprior.training.saved import load_policy
+from warmprior.training.option_text import find, make, options_of
 
 D_A, H, TO = 2, 4, 2
 actor_for = partial(mlp_actor, observation_dim=3)

@@ -23,7 +23,7 @@ from warmprior import (
     make_prior_space_actor,
     policy_transforms,
 )
-from warmprior.training import play_episode
+from warmprior.evaluation import play_episode
 
 H, TO, D_O, DELTA = 3, 2, 2 + ACTION_DIM, 0.5
 LENGTHS = (7, 4)

@@ -8,8 +8,9 @@ from tests.errors import raises
 from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
 from tests.states import same
 from warmprior import GaussianPrior, PastPrior, policy_transforms
+from warmprior.evaluation import evaluate, parallel_env
 from warmprior.rl import improve_policy, improved_policy
-from warmprior.training import evaluate, load_policy, parallel_env, save_policy
+from warmprior.saving import load_policy, save_policy
 
 
 class ReachEnv(SolvableEnv):

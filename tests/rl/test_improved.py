@@ -26,9 +26,10 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.deploy import AsyncExecutor
+from warmprior.evaluation import evaluate
 from warmprior.history import ENTRIES
 from warmprior.rl import improved_policy
-from warmprior.training import evaluate, load_policy, save_policy
+from warmprior.saving import load_policy, save_policy
 
 WIDTH = 2 + ACTION_DIM
 

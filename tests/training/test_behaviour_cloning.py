@@ -24,8 +24,9 @@ from tests.training.cloning_parts import (
     weights,
 )
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
-from warmprior.training import TrainingConfig, load_policy
-from warmprior.training.checkpoint import load_state
+from warmprior.saving import load_policy
+from warmprior.saving.checkpoint import load_state
+from warmprior.training import TrainingConfig
 from warmprior.training.optim import make_optimizer
 from warmprior.training.options import PAPER
 

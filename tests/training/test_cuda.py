@@ -14,8 +14,10 @@ from tests.states import copied, same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, training, weights
 from tests.training.test_synchronisation import CASES
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.training import NetworkOptions, evaluate, load_policy, train_policy
-from warmprior.training.checkpoint import load_state
+from warmprior.evaluation import evaluate
+from warmprior.saving import load_policy
+from warmprior.saving.checkpoint import load_state
+from warmprior.training import NetworkOptions, train_policy
 from warmprior.training.placement import placed
 
 pytestmark = pytest.mark.cuda

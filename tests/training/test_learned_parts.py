@@ -13,8 +13,10 @@ from tests.together import together
 from tests.toy_env import demonstrations, random_history
 from warmprior import CVAEPrior, GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint
 from warmprior.deploy import AsyncExecutor
-from warmprior.training import NetworkOptions, Task, TrainingConfig, load_policy, train_policy
-from warmprior.training.checkpoint import load_state, save_state
+from warmprior.saving import load_policy
+from warmprior.saving.checkpoint import load_state, save_state
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 H = 4
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)

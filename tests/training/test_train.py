@@ -14,8 +14,10 @@ from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
 from warmprior.data import RobomimicDemonstrations
 from warmprior.deploy import AsyncExecutor
+from warmprior.evaluation import evaluate
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import NetworkOptions, TrainingConfig, evaluate, load_policy, train_policy
+from warmprior.saving import load_policy
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)

@@ -18,7 +18,7 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.training.saved import load_policy, save_policy
+from warmprior.saving.policies import load_policy, save_policy
 
 H, TO = 3, 2
 LENGTHS = (7, 4)

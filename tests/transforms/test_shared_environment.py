@@ -21,7 +21,7 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.deploy import AsyncExecutor
-from warmprior.training import play_episode
+from warmprior.evaluation import play_episode
 
 H, LENGTH = 3, 7
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.lerobot import LeRobotDemonstrations
-from warmprior.data.minari import MinariDemonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.minari import MinariDemonstrations
 from warmprior.data.observe import observe_recordings
 from warmprior.data.replay import DatasetError
-from warmprior.data.robomimic import RobomimicDemonstrations
 
 __all__ = [
     "DatasetError",

@@ -17,10 +17,16 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from warmprior.checks import check_choice
-from warmprior.data.hdf5 import read_index, read_masks, read_origin
-from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, read_index, read_masks, read_origin
+from warmprior.data.formats.lerobot_index import (
+    DESCRIPTION,
+    REWARD,
+    SUCCESS,
+    action_names,
+    layout_of,
+    state_names,
+)
 from warmprior.data.replay import DatasetError, DatasetIndex, declared_poses, solved
-from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE

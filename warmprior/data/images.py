@@ -9,9 +9,9 @@ from importlib.metadata import version
 
 import numpy as np
 
-from warmprior.data.hdf5 import read_origin
-from warmprior.data.lerobot_index import LeRobotIndex
-from warmprior.data.opening import Demonstrations
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.hdf5 import read_origin
+from warmprior.data.formats.lerobot_index import LeRobotIndex
 from warmprior.data.replay import DatasetError, DatasetIndex, store_finite
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import member, open_robomimic, read_described, reading, selected_demos
+from warmprior.data.formats.hdf5 import member, open_robomimic, read_described, reading, selected_demos
 from warmprior.data.replay import DatasetError, check_count, check_env_args, store_finite
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.env_args import modernize_env_args

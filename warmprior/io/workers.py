@@ -19,7 +19,7 @@ class WorkerError(RuntimeError):
     """A worker process died, or cannot do the work.
 
     Examples:
-        >>> from warmprior.training import WorkerError
+        >>> from warmprior.evaluation import WorkerError
         >>> raise WorkerError("worker 0 of 2 (exit code 9) died")
         Traceback (most recent call last):
             ...

@@ -157,9 +157,8 @@ class WarmPriorActor(TensorDictModuleBase):
         prior: the source distribution.
         start: the point from which integration starts; the source sample by default.
         guidance: makes chunks continue the one being executed; none by default.
-        normalizer: the normaliser of the data. Append its
-            :meth:`~warmprior.Normalizer.env_transforms` after the base environment and any transforms that
-            convert actions or images.
+        normalizer: the normaliser of the data; its :func:`~warmprior.normalizing_transforms` come after the
+            base environment and any transforms that convert actions or images.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             for ``python -m warmprior evaluate FOLDER``.
         generator: random generator of the sampler, which can also be passed per call: ``actor(data,

@@ -10,48 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
 from warmprior.checks import check_finite_steps, check_keys, check_shape
 
 LEAST = 1e-5
 """Half the range up to which a dimension counts as constant, in its unit, or as a share of its middle."""
-
-
-class FloatNorm(ObservationNorm):
-    """TorchRL's transform, for integers and flags too: its specs would keep their type, and buffers cut."""
-
-    def _apply_transform(self, obs: Tensor) -> Tensor:
-        return super()._apply_transform(obs if obs.is_floating_point() else obs.to(self.loc.dtype))
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Set the spec of what is normalised, which has the precision of the statistics, or a higher one."""
-        present = sorted(map(str, observation_spec.keys(True, True)))
-        hint = f", the environment writes {present}: rename its entry, or fit the normaliser to data with it"
-        check_keys(observation_spec, self.in_keys, "the normaliser of the demonstrations", hint)
-        for key in self.in_keys:
-            leaf = observation_spec[key]
-            check_width(key, leaf.shape, self.loc)
-            dtype = torch.promote_types(leaf.dtype, self.loc.dtype)
-            if leaf.dtype != dtype:
-                observation_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)
-        return super().transform_observation_spec(observation_spec)
-
-
-class FloatScaling(ActionScaling):
-    """TorchRL's transform, in the precision of the actions and not in that of the statistics."""
-
-    def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        return super()._inv_apply_transform(action).to(action.dtype)
-
-    def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """Set the spec of the normalised action, which has the width of the statistics."""
-        for key in self.in_keys_inv:
-            if key in action_spec.keys(True, True):
-                check_width(key, action_spec[key].shape, self.loc)  # one number would fit any width
-        return super().transform_action_spec(action_spec)
 
 
 def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
@@ -216,20 +180,6 @@ class Normalizer(RawUnits):
                 check_width(key, value.shape, self.loc(key))
                 data.set(key, value * self.scale(key) + self.loc(key))
         return data
-
-    def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
-        """Return TorchRL transforms that (de)normalise directly after the base environment.
-
-        Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step.
-        """
-        transforms: list[Transform] = []
-        for key in self.keys:
-            loc, scale = self.loc(key).clone(), self.scale(key).clone()
-            if key == action_key:
-                transforms.append(FloatScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
-            else:
-                transforms.append(FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
-        return transforms
 
     def config(self) -> dict[str, Any]:
         """Return the keys and their shapes in JSON form; the values themselves are buffers."""

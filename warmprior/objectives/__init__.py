@@ -1,8 +1,11 @@
 """The loss, and how it pairs sources with targets."""
 
+from warmprior.objectives.couplings import OTCoupling, ReflowCoupling
 from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
 
 __all__ = [
     "Coupling",
     "FlowMatchingLoss",
+    "OTCoupling",
+    "ReflowCoupling",
 ]

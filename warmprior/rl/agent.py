@@ -29,7 +29,7 @@ from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
-from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
+from warmprior.saving.checkpoint import named, restore_optimizer, select, snapshot_optimizer
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from torchrl.envs.transforms import Compose
 from warmprior.checks import check_whole_numbers
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.evaluation.episodes import evaluate
+from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.training import PriorSpaceTraining
-from warmprior.training.evaluation import evaluate
-from warmprior.training.parallel import parallel_env
 
 SMALL = PriorSpaceConfig(
     environment_steps=100_000,
@@ -83,12 +83,12 @@ def improve_policy(
     evaluations is kept, or the frozen policy if none was better; both then play other episodes.
 
     Args:
-        policy: the policy, such as one of :func:`~warmprior.training.load_policy`. It must solve some
+        policy: the policy, such as one of :func:`~warmprior.saving.load_policy`. It must solve some
             episodes: where it solves none, there is no reward to learn from.
         directory: folder of the training, which continues where it was interrupted.
 
     Keyword Args:
-        make_env: builds the environment, called as for :func:`~warmprior.training.parallel_env`; by default
+        make_env: builds the environment, called as for :func:`~warmprior.evaluation.parallel_env`; by default
             the environment that the policy was made for.
         make_transforms: builds the policy's transforms for ``make_env``.
         num_envs: environments in worker processes.

@@ -108,8 +108,8 @@ def improved_policy(
     """Return a policy whose flow starts where an agent chooses, with copies of the agent and the source.
 
     It is a :class:`~warmprior.WarmPriorActor` with a start point: it works in ``env.rollout``,
-    :func:`~warmprior.training.evaluate`, :class:`~warmprior.deploy.AsyncExecutor` and
-    :func:`~warmprior.training.save_policy` like the policy before. Its chunks are those that
+    :func:`~warmprior.evaluation.evaluate`, :class:`~warmprior.deploy.AsyncExecutor` and
+    :func:`~warmprior.saving.save_policy` like the policy before. Its chunks are those that
     :class:`~warmprior.PriorDecoder` decodes in the agent's environment.
 
     Args:

@@ -20,13 +20,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from warmprior import keys
 from warmprior.checks import check_finite, check_keys
+from warmprior.evaluation.episodes import evaluate
+from warmprior.evaluation.parallel import transforms_of, watched
 from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.improved import improved_policy
-from warmprior.training.checkpoint import (
+from warmprior.saving.checkpoint import (
     RunState,
     as_key,
     digest_of_state,
@@ -35,8 +37,6 @@ from warmprior.training.checkpoint import (
     save_state,
     select,
 )
-from warmprior.training.evaluation import evaluate
-from warmprior.training.parallel import transforms_of, watched
 from warmprior.transforms.chunk import ChunkStep
 
 

@@ -17,7 +17,7 @@ from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
-from warmprior.training.checkpoint import (
+from warmprior.saving.checkpoint import (
     module_tensors,
     named,
     restore_module,

@@ -18,8 +18,7 @@ from warmprior.io.files import exclusive
 from warmprior.modules.actor import StartPoint
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.training.behaviour_cloning import STATE_FORMAT
-from warmprior.training.checkpoint import (
+from warmprior.saving.checkpoint import (
     check_identity,
     data_digest,
     load_state,
@@ -28,8 +27,9 @@ from warmprior.training.checkpoint import (
     restoring,
     save_state,
 )
+from warmprior.saving.policies import NoLargerThan
+from warmprior.training.cloning import STATE_FORMAT
 from warmprior.training.options import TrainingConfig
-from warmprior.training.saved import NoLargerThan
 from warmprior.transforms.window import window_replay_buffer, without_images
 
 SHARE = 0.25

@@ -24,12 +24,12 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, Slope, Sour
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.flow_matching import Coupling
-from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.saving.policies import load_policy
+from warmprior.tasks.task import Task
+from warmprior.training.cloning import BehaviourCloning
 from warmprior.training.learned_parts import learned, learns_first
 from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed
-from warmprior.training.saved import load_policy
-from warmprior.training.task import Task
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_replay_buffer, without_images
 

@@ -5,6 +5,7 @@ from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, executed_chunk
 from warmprior.transforms.history import ActionHistory, HistoryObservation, WithheldHistory
 from warmprior.transforms.images import CameraImages, EncodeObservation
+from warmprior.transforms.normalize import normalizing_transforms
 from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
@@ -21,6 +22,7 @@ __all__ = [
     "ObservationStack",
     "WithheldHistory",
     "executed_chunk",
+    "normalizing_transforms",
     "policy_transforms",
     "window_replay_buffer",
     "window_transforms",

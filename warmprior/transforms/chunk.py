@@ -23,10 +23,10 @@ from torchrl.envs.transforms import (
 
 from warmprior import keys
 from warmprior.checks import check_between, check_choice, check_whole_numbers
-from warmprior.modules.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
+from warmprior.transforms.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.restarts import flat
 from warmprior.transforms.stack import ObservationStack
 

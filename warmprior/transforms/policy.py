@@ -14,6 +14,7 @@ from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep, Measures
 from warmprior.transforms.delay import InferenceDelay, check_delay, usual_execute
 from warmprior.transforms.history import ActionHistory, HistoryObservation
+from warmprior.transforms.normalize import normalizing_transforms
 from warmprior.transforms.stack import ObservationStack
 
 
@@ -106,7 +107,7 @@ def policy_transforms(
         check_delay(delay, execute, prior.prediction_length)
         late.append(InferenceDelay(delay, execute=execute, chunk_key=chunk_key, history_key=history_key))
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
-    per_step += [] if normalizer is None else normalizer.env_transforms(action_key)
+    per_step += [] if normalizer is None else normalizing_transforms(normalizer, action_key)
     return Compose(
         *per_step,
         ObservationStack(observation_steps, observation_key=observation_key),

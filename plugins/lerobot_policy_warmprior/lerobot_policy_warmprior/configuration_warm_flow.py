@@ -17,9 +17,9 @@ from warmprior import Prior
 from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
-from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
 from warmprior.training import warmup_cosine
+from warmprior.training.option_text import build
 
 
 @LRSchedulerConfig.register_subclass("warmup_ratio")

@@ -11,8 +11,8 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
-from warmprior.modules.option_text import build
 from warmprior.modules.registry import registered
+from warmprior.training.option_text import build
 
 DEFAULT_PRIOR = "past,correlation=0.5"
 """The default of this library's command line too."""

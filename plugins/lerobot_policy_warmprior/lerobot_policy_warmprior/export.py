@@ -23,7 +23,7 @@ from warmprior import PreconditionedNetwork, VelocityNetwork, keys
 from warmprior.envs import TASKS
 from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
-from warmprior.training.saved import load_policy
+from warmprior.saving.policies import load_policy
 
 _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.state": FeatureType.STATE}
 

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.hdf5 import read_index
-from warmprior.data.lerobot import LeRobotDemonstrations
-from warmprior.data.lerobot_index import camera_images, read_lerobot_index
-from warmprior.data.minari import MinariDemonstrations, minari_environment, read_minari_index
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, read_index
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.lerobot_index import camera_images, read_lerobot_index
+from warmprior.data.formats.minari import MinariDemonstrations, minari_environment, read_minari_index
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
-from warmprior.data.robomimic import RobomimicDemonstrations
 from warmprior.io.files import digest_of, file_digest
 
 LEROBOT, MINARI = "lerobot:", "minari:"
@@ -42,7 +41,7 @@ class Demonstrations:
     ``"train"``, selects some demonstrations. ``name`` is the name of the place in results.
 
     Examples:
-        >>> from warmprior.data.opening import Demonstrations
+        >>> from warmprior.data.demonstrations import Demonstrations
         >>> Demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
     """

@@ -39,7 +39,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
     with :func:`registered`, which imports nothing, and pass the class to :func:`build`.
 
     Examples:
-        >>> from warmprior.modules.option_text import make
+        >>> from warmprior.training.option_text import make
         >>> from warmprior import Prior
         >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)

@@ -47,7 +47,7 @@ def parallel_env(
         >>> from functools import partial
         >>> from warmprior import PastPrior, policy_transforms
         >>> from warmprior.envs import NavigationEnv
-        >>> from warmprior.training import parallel_env
+        >>> from warmprior.evaluation import parallel_env
         >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
         ...     return NavigationEnv()
         >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)

@@ -7,7 +7,7 @@ from functools import partial
 
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
-from warmprior.training.parallel import base_of
+from warmprior.evaluation.parallel import base_of
 
 
 def row_seeding(env: EnvBase) -> Callable[[int, int], None]:

@@ -14,7 +14,7 @@ from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_description, environment_of, registered_description
 from warmprior.envs.simulator import task_env_args
-from warmprior.training import play_episode, record_filmstrip
+from warmprior.evaluation import play_episode, record_filmstrip
 
 
 def test_frames_are_of_the_evaluated_episode(monkeypatch):

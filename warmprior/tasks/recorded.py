@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.images import check_images
-from warmprior.data.opening import Demonstrations
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.simulator import task_env_args

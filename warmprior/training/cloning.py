@@ -21,7 +21,7 @@ from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of, uncompiled
 from warmprior.objectives.flow_matching import Coupling
-from warmprior.training.checkpoint import (
+from warmprior.saving.checkpoint import (
     RunState,
     data_digest,
     fixed_identity,
@@ -31,10 +31,10 @@ from warmprior.training.checkpoint import (
     rng_tensors,
     select,
 )
+from warmprior.saving.policies import check_saveable, load_policy, policy_config, save_policy
 from warmprior.training.gradient_step import GradientStep
 from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
-from warmprior.training.saved import check_saveable, load_policy, policy_config, save_policy
 from warmprior.transforms.window import window_replay_buffer
 
 WINDOWS_SEED = 1_000_003

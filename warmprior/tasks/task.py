@@ -23,7 +23,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.trend import RestingAction, RestingJoints
-from warmprior.training.checkpoint import data_digest
+from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
 from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
@@ -66,7 +66,7 @@ class Task:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.envs import GymEnv
-        >>> from warmprior.training import Task
+        >>> from warmprior.tasks import Task
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> task = Task.of("pendulum", TensorDict(steps, [60]), lambda: GymEnv("Pendulum-v1"))
@@ -211,16 +211,16 @@ class Task:
                 is unknown or for another environment.
 
         Examples:
-            >>> from warmprior.training import Task
+            >>> from warmprior.tasks import Task
             >>> Task.open("square.hdf5", mask="train").name  # doctest: +SKIP
             'square'
         """
         # Imported here, since training on a TensorDict needs no reader and no simulator.
+        from warmprior.data.demonstrations import name_of_place
         from warmprior.data.images import renderer_versions
-        from warmprior.data.opening import name_of_place
         from warmprior.envs.description import registered_description
         from warmprior.envs.gymnasium import registered_env
-        from warmprior.training import files
+        from warmprior.tasks import recorded as files
 
         check_choice("actions", actions, get_args(Actions))
         outcome = given(success=success, measures=measures, video_rate=video_rate)
@@ -302,7 +302,7 @@ class Task:
         Examples:
             >>> import torch
             >>> from tensordict import TensorDict
-            >>> from warmprior.training import Task
+            >>> from warmprior.tasks import Task
             >>> joints = torch.rand(60, 3)
             >>> steps = {"observation": joints, "action": joints[:, 1:] + 0.01}
             >>> steps = TensorDict(steps | {"episode": torch.arange(60) // 20}, [60])

@@ -8,7 +8,7 @@ from tests.errors import raises
 from tests.io.hub_server import TOKEN, Repository, model_hub
 from tests.toy_env import mlp_actor, random_history
 from warmprior import Normalizer, PastPrior
-from warmprior.training.saved import load_policy, policy_config, push_policy, save_policy
+from warmprior.saving.policies import load_policy, policy_config, push_policy, save_policy
 
 pytest.importorskip("huggingface_hub")
 

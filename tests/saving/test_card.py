@@ -18,7 +18,7 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.training import model_card
+from warmprior.saving import model_card
 
 ACTOR = mlp_actor(PastPrior(4))
 FACTS = {"task": "drift", "data": "own", "prior": "past", "options": "", "sigma": 0.5, "chunk": 4}

@@ -10,7 +10,8 @@ from tests.errors import raises
 from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing, placed
 from warmprior import ChunkStep, PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
-from warmprior.training import Task, evaluate, parallel_env, play_episode
+from warmprior.evaluation import evaluate, parallel_env, play_episode
+from warmprior.tasks import Task
 
 H = 4
 HOW = {"high": "max", "effort": "sum", "left": "last"}

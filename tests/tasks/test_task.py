@@ -18,8 +18,9 @@ from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend, RestingJoints, keys
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
-from warmprior.training import NetworkOptions, Task, TrainingConfig
-from warmprior.training.files import opened
+from warmprior.tasks import Task
+from warmprior.tasks.recorded import opened
+from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.train import new_policy
 from warmprior.transforms import AbsoluteActions
 

@@ -28,11 +28,13 @@ from warmprior import (
     PriorDecoder,
     ResidualSampler,
     WarmPriorActor,
+    normalizing_transforms,
     policy_transforms,
 )
+from warmprior.evaluation import Episode, evaluate, parallel_env, play_episode
+from warmprior.evaluation.parallel import watched
 from warmprior.io.workers import WorkerError
-from warmprior.training import Episode, Task, evaluate, parallel_env, play_episode
-from warmprior.training.parallel import watched
+from warmprior.tasks import Task
 
 H = 3
 
@@ -366,7 +368,7 @@ def test_policy_and_environment_need_one_normaliser():
         TransformedEnv(TransformedEnv(SeededEnv(), transforms[1].clone()), StepCounter()),
         # The environment's own units, below, are its own.
         TransformedEnv(
-            TransformedEnv(SeededEnv(), Compose(*other.env_transforms())),
+            TransformedEnv(SeededEnv(), Compose(*normalizing_transforms(other))),
             transforms[1].clone(),
             auto_unwrap=False,
         ),
@@ -374,7 +376,9 @@ def test_policy_and_environment_need_one_normaliser():
         assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
     # Of observations alone.
     alone = Normalizer(*({"observation": s * ones["observation"]} for s in (-1.0, 3.0)))
-    seen = TransformedEnv(SeededEnv(), Compose(*alone.env_transforms(), policy_transforms(PastPrior(H))))
+    seen = TransformedEnv(
+        SeededEnv(), Compose(*normalizing_transforms(alone), policy_transforms(PastPrior(H)))
+    )
     assert evaluate(actor.replace(normalizer=alone), seen, episodes=1, first_seed=0)[0].steps == length_of(0)
     for wrong in (None, other):
         with raises(ValueError, "normalizer=policy.normalizer"):

@@ -37,7 +37,7 @@ class OTCoupling:
 
     Examples:
         >>> import torch
-        >>> from lab.couplings import OTCoupling
+        >>> from warmprior import OTCoupling
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
         >>> [x.flatten().tolist() for x in OTCoupling(observation_weight=0.0)(a0, a1)]
         [[1.0, 0.0], [5.0, 4.0]]
@@ -104,7 +104,7 @@ class ReflowCoupling:
     Examples:
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
-        >>> from lab.couplings import ReflowCoupling
+        >>> from warmprior import ReflowCoupling
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
         >>> a0, a1, observation = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
         >>> source, target = couple(a0, a1, observation)

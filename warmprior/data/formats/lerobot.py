@@ -13,7 +13,13 @@ import torch
 from torch import Tensor
 
 from warmprior.checks import check_shape
-from warmprior.data.lerobot_index import REWARD, SUCCESS, LeRobotIndex, episode_file, read_lerobot_index
+from warmprior.data.formats.lerobot_index import (
+    REWARD,
+    SUCCESS,
+    LeRobotIndex,
+    episode_file,
+    read_lerobot_index,
+)
 from warmprior.data.replay import (
     DemonstrationReader,
     DemonstrationReplay,

@@ -13,11 +13,11 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
+from warmprior.evaluation.episodes import play_episode
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, write_atomic
 from warmprior.keys import SUCCESS
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.training.evaluation import play_episode
 from warmprior.transforms.inner_step import EnvTransform
 
 
@@ -82,7 +82,7 @@ class Filmstrip:
 
     Examples:
         >>> import numpy as np
-        >>> from warmprior.training import Filmstrip
+        >>> from warmprior.evaluation import Filmstrip
         >>> strip = Filmstrip([np.zeros((160, 160, 3), np.uint8)] * 3, steps=[0, 38, 76], success=True)
         >>> np.hstack(strip.frames).shape
         (160, 480, 3)
@@ -131,7 +131,8 @@ def record_filmstrip(
 
     Examples:
         >>> from pathlib import Path
-        >>> from warmprior.training import load_policy, record_filmstrip
+        >>> from warmprior.evaluation import record_filmstrip
+        >>> from warmprior.saving import load_policy
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_filmstrip(actor, seed=10_000_000, nfe=1, frames=5).steps  # doctest: +SKIP
         [0, 24, 48, 71, 95]

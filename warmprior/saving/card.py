@@ -10,7 +10,7 @@ from typing import Any
 from warmprior.io.extras import require
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.registry import Registered
-from warmprior.training.saved import policy_config
+from warmprior.saving.policies import policy_config
 
 
 def model_card(
@@ -36,7 +36,7 @@ def model_card(
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import model_card
+        >>> from warmprior.saving import model_card
         >>> card = model_card(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), licence="mit")
         >>> "license: mit" in card, "`PastPrior(chunk_length=4, sigma=0.5, correlation=0.0)`" in card
         (True, True)

@@ -9,11 +9,18 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
-from lab.couplings import OTCoupling, ReflowCoupling
 from tests.errors import raises
 from tests.objectives.test_flow_matching import actor_for, sample
 from tests.toy_env import demonstrations, mlp_actor
-from warmprior import FlowMatchingLoss, GaussianPrior, SourceMoments, WarmPriorActor, window_replay_buffer
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    OTCoupling,
+    ReflowCoupling,
+    SourceMoments,
+    WarmPriorActor,
+    window_replay_buffer,
+)
 
 pytest.importorskip("scipy")
 

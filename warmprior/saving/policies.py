@@ -28,7 +28,7 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
 from warmprior.modules.trend import RestingAction
-from warmprior.training.checkpoint import as_key, load_state, save_state
+from warmprior.saving.checkpoint import as_key, load_state, save_state
 
 FORMAT = 8
 """The version of the layout that :func:`save_policy` writes."""
@@ -194,7 +194,7 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
     Examples:
         >>> from tempfile import TemporaryDirectory
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import load_policy, save_policy
+        >>> from warmprior.saving import load_policy, save_policy
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
         >>> with TemporaryDirectory() as folder:
         ...     save_policy(actor, folder)
@@ -225,7 +225,7 @@ def push_policy(
         repository: name of the repository, such as ``"user/name"``.
 
     Keyword Args:
-        card: text of its ``README.md``, such as that of :func:`~warmprior.training.model_card`; by default
+        card: text of its ``README.md``, such as that of :func:`~warmprior.saving.model_card`; by default
             an existing one stays.
         private: True for a new private repository; by default the account's setting.
         revision: branch; the main one by default.
@@ -240,7 +240,7 @@ def push_policy(
         OSError: if the hub refuses the upload (the hub client's own error).
 
     Examples:
-        >>> from warmprior.training import load_policy, model_card, push_policy
+        >>> from warmprior.saving import load_policy, model_card, push_policy
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> push_policy(actor, "user/square-past", card=model_card(actor))  # doctest: +SKIP
         '0123456789abcdef0123456789abcdef01234567'
@@ -294,7 +294,7 @@ def load_policy(
     Examples:
         >>> from tempfile import TemporaryDirectory
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import load_policy, save_policy
+        >>> from warmprior.saving import load_policy, save_policy
         >>> with TemporaryDirectory() as folder:
         ...     save_policy(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), folder)
         ...     load_policy(folder).prior.chunk_length

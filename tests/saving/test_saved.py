@@ -24,8 +24,8 @@ from warmprior import (
     WarmPriorActor,
     keys,
 )
-from warmprior.training.checkpoint import load_state, save_state
-from warmprior.training.saved import FORMAT, load_policy, policy_config, save_policy
+from warmprior.saving.checkpoint import load_state, save_state
+from warmprior.saving.policies import FORMAT, load_policy, policy_config, save_policy
 
 H, D_A, D_O, TO = 3, 2, 5, 2
 ACTION = "normalizer.action_scale"
@@ -122,7 +122,7 @@ def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
     assert torch.equal(chunk(again), chunk(actor))
 
 
-@pytest.mark.parametrize("where", ["os.replace", "warmprior.training.checkpoint.save_file", "os.fsync"])
+@pytest.mark.parametrize("where", ["os.replace", "warmprior.saving.checkpoint.save_file", "os.fsync"])
 def test_a_full_disk_leaves_the_old_policy(tmp_path, monkeypatch, where):
     """Overwriting a policy must not leave new weights beside an old configuration."""
     saved(tmp_path)

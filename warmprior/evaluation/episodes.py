@@ -18,13 +18,13 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers, is_true
+from warmprior.evaluation.parallel import base_of, transforms_of, watched
+from warmprior.evaluation.row_seeds import row_seeding
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
-from warmprior.training.parallel import base_of, transforms_of, watched
-from warmprior.training.row_seeds import row_seeding
-from warmprior.training.task import Task
+from warmprior.tasks.task import Task
 from warmprior.transforms.chunk import ChunkStep, Measures, check_measures
 
 Act = Callable[[TensorDictBase], TensorDictBase]
@@ -48,7 +48,7 @@ class Episode:
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from warmprior.training import Episode
+        >>> from warmprior.evaluation import Episode
         >>> solved = Episode(7, True, 90, decisions=TensorDict({}, [12]))
         >>> solved.success, len(solved.decisions)
         (True, 12)
@@ -145,7 +145,7 @@ def play_episode(
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
-        >>> from warmprior.training import play_episode
+        >>> from warmprior.evaluation import play_episode
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
         >>> env = TransformedEnv(NavigationEnv((1, 1)), transforms)
@@ -222,7 +222,7 @@ def evaluate(
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
-        >>> from warmprior.training import evaluate
+        >>> from warmprior.evaluation import evaluate
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
         >>> env = TransformedEnv(NavigationEnv((1, 1), batch_size=[4]), transforms)
