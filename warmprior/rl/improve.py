@@ -11,8 +11,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from warmprior.checks import check_whole_numbers
-from warmprior.envs.description import environment_parts
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
@@ -121,6 +119,10 @@ def improve_policy(
         >>> result.before, result.after  # doctest: +SKIP
         (0, 0)
     """
+    # Only here, because the package is imported without its environments.
+    from warmprior.envs.description import environment_parts
+    from warmprior.envs.tasks import EVALUATION_SEED
+
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     if make_env is None:
         make_env, make_transforms = environment_parts(policy)
