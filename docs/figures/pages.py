@@ -13,11 +13,14 @@ from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
 
 from lab.statistics import chosen_elsewhere
 
+SLOPES = {"marginal": "over all data", "conditional": "given the observation"}
+
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
 
-PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk|curvature) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
-"""This matches the table of a run in a page: by NFE and noise, sigma, or chunk length, or of curvature."""
+PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk|curvature|slope) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the table of a run in a page: by NFE and noise, sigma, chunk length or
+slope, or of curvature."""
 
 
 def played_table(name: str) -> str:
@@ -96,6 +99,24 @@ def study_table(column: str, name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def slope_table(name: str) -> str:
+    """Return success in Markdown, in percent, with that of each training: a line per NFE and slope."""
+    rows = read_played(name)
+    names = shown_sources(rows)
+    text = [f"| NFE | slope | {' | '.join(SOURCES[source][0] for source in names)} |"]
+    text.append("|---" * (2 + len(names)) + "|")
+    for nfe in sorted(rows["nfe"].unique(), reverse=True):
+        for slope, words in SLOPES.items():
+            entries = []
+            for source in names:
+                part = rows[(rows["nfe"] == nfe) & (rows["slope"] == slope) & (rows["source"] == source)]
+                each = [f"{100 * rate:.0f}" for rate in part.sort_values("seed")["success_rate"]]
+                one = f" ({', '.join(each)})" if len(each) > 1 else ""
+                entries.append(f"{100 * part['success_rate'].mean() + 1e-6:.0f}{one}" if each else "")
+            text.append(f"| {nfe} | {words} | {' | '.join(entries)} |")
+    return "\n".join(text) + "\n"
+
+
 def curvature_table(name: str) -> str:
     """Return curvature relative to the Gaussian source in Markdown, at the mean of the data."""
     rows = read_json(DATA / f"{name}.jsonl", lines=True).query("mean == 'training'")
@@ -119,7 +140,8 @@ def with_tables(page: str, tables: Sequence[str]) -> str:
 
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
-        drawn = {"rows": played_table, "curvature": curvature_table}.get(kind, partial(study_table, kind))
+        kinds = {"rows": played_table, "curvature": curvature_table, "slope": slope_table}
+        drawn = kinds.get(kind, partial(study_table, kind))
         return f"{kind} {name}{end}{drawn(name)}"
 
     page = TABLE.sub(lambda _: next(texts), page)
