@@ -311,7 +311,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
     """Play episodes; their noise depends on the seeds of policy and episode only."""
     actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
     task = policy.task()
-    outcome: dict[str, Any] = {"success": task.success, "measures": task.measures}
+    outcome: dict[str, Any] = {"success": task.play.success, "measures": task.play.measures}
     outcome |= {"nfe": cell.nfe, "policy_seed": policy.training.seed}
     return [play_episode(actor, env, episode, **outcome) for episode in seeds]
 

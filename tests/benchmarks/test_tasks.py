@@ -20,7 +20,8 @@ from tests.envs.mimicgen_stub import write_mimicgen
 from tests.errors import raises
 from tests.processes import apart
 from warmprior import ImageEncoder
-from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
+from warmprior.data import DatasetError, convert_robomimic
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
@@ -99,7 +100,7 @@ def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monk
     actor = load_policy(folder).eval()
     names = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
     cameras = ["agentview_image", "robot0_eye_in_hand_image"]
-    data = RobomimicDemonstrations(path, observation_keys=names, image_keys=cameras).data[:10]
+    data = RobomimicDemonstrations(path).steps(observations=names, images=cameras)[:10]
     data = actor.normalizer.normalize(data.exclude("next"))
     observation = torch.stack([data["observation"]] * 2, 1).auto_batch_size_(1)
     windows = data.select("action").set("observation", observation)
@@ -143,7 +144,7 @@ def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
     # The agent, then the block's corners; both within [-1, 1].
     assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
     assert every.data["observation"].abs().max().item() == pytest.approx(1.0)
-    assert every.success == "is_success" and every.measures == {"coverage": "max"}
+    assert every.play.success == "is_success" and every.play.measures == {"coverage": "max"}
     # Offsets from where the agent is.
     raw, moved = (t.normalizer.denormalize(t.data.clone()) for t in (every, pusht.relative(given[0])))
     torch.testing.assert_close(moved["action"] + raw["observation"][:, :2], raw["action"])

@@ -7,7 +7,7 @@ from tests.errors import raises
 from tests.lerobot.plugin_policies import flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
 from warmprior import HistoryObservation, Normalizer, PastPrior, RealTimeChunking, VelocityMLP, keys
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
 
@@ -51,7 +51,7 @@ def dataset_policy(found, root, episodes=None, place=None, streamed=False, **opt
 
 def moments_by_hand(policy, dataset, episodes):
     """Return the moments of some episodes, normalised by all, as LeRobot's processors do: -1 if constant."""
-    steps = LeRobotDemonstrations(dataset.root, observation_keys=policy.config.observed).data
+    steps = LeRobotDemonstrations(dataset.root).steps(observations=policy.config.observed)
     steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
     low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
     steps["action"] = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1

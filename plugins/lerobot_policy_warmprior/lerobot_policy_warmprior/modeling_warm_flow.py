@@ -33,7 +33,7 @@ from warmprior import (
     keys,
 )
 from warmprior.checks import check_choice
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data import open_demonstrations
 from warmprior.history import window_history
 from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
@@ -175,8 +175,9 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 "set --dataset.streaming=false, or --policy.precondition=false"
             )
         episodes = training_episodes(dataset_meta)
-        chosen: Any = {"observation_keys": self.config.observed, "episodes": episodes}
-        steps = LeRobotDemonstrations(dataset_meta.root, **chosen).data.copy()
+        steps = open_demonstrations(f"lerobot:{dataset_meta.root}", episodes=episodes).steps(
+            self.config.observed
+        )
         # LeRobot's own step, because it maps a constant dimension to -1.
         features = {keys.ACTION: self.config.action_feature}
         norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
