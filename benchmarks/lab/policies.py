@@ -37,10 +37,10 @@ from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.checkpoint import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
-from warmprior.training.cloning import STATE_FORMAT, policy_path
+from warmprior.training.cloning import policy_path
 
 
 @dataclass(frozen=True)
@@ -155,19 +155,17 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     """Return the policy of another method on a task, with the options of the policy `like`."""
-    digest = digest_of(
+    identity = run_identity(
         task.identity,
         asdict(like.training),
-        method.config(),
-        asdict(like.network),
-        like.run.device,
-        like.run.compile,
-        version("torch"),
-        version("warmprior"),
-        STATE_FORMAT,
+        method=method.config(),
+        network=asdict(like.network),
+        device=like.run.device,
+        compile=like.run.compile,
+        versions={name: version(name) for name in ("torch", "warmprior")},
     )
     source = slug(",".join(filter(None, (method.name, method.options))))
-    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest[:10]}"
+    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest_of(identity)[:10]}"
     facts = {
         "task": task.name,
         "data": task.style,
