@@ -25,10 +25,11 @@ from lab.presets import PRESETS
 from lab.scripted.episode import Episode, write_robomimic
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
+from warmprior.data import open_demonstrations
 from warmprior.data.formats.hdf5 import open_robomimic, selected_demos
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 
 SQUARE, ARM = "square", "robot0_"
 OBSERVATION = ["object", f"{ARM}joint_pos", f"{ARM}gripper_qpos"]
@@ -112,12 +113,11 @@ def task(options: DataOptions) -> Task:
     if style not in ("ph", "mh"):
         raise ValueError(f"--data {style} has no scripted demonstrations: choose ph or mh")
     path = demonstrations(style, options.count(style))
-    return Task.open(
-        path,
-        style=style,
-        observation_keys=OBSERVATION,
-        joint_key=f"{ARM}joint_pos",
-        horizon=options.time_limit,
+    return Task(
+        open_demonstrations(path, style=style),
+        observations=OBSERVATION,
+        joints=f"{ARM}joint_pos",
+        play=Play(horizon=options.time_limit),
     )
 
 

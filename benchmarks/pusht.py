@@ -23,10 +23,10 @@ from lab.command_line import script
 from lab.options import with_parts
 from lab.presets import PRESETS
 from lab.tasks import DataOptions
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data import demonstrations_of, open_demonstrations
 from warmprior.envs import gym_env
 from warmprior.io.extras import require
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 
 SIDE = 512.0  # side of the field in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners
@@ -49,14 +49,14 @@ def make_env(relative: bool = False) -> EnvBase:
 def task(options: DataOptions, relative: bool = False) -> Task:
     """Return the task: human demonstrations, and the environment that policies are played in."""
     options.check_only("task", "dataset", "demonstrations")
-    place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
-    chosen: Any = {"observation_keys": OBSERVATION, "demos": options.first("human")}
-    steps = LeRobotDemonstrations(place, **chosen).data.copy()
+    place = options.dataset or "lerobot:lerobot/pusht_keypoints"
+    steps = open_demonstrations(place, demos=options.first("human")).steps(OBSERVATION)
     if relative:
         steps["action"] = steps["action"] - steps["observation"][:, :2]
-    ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "video_rate": 10}
-    style = "relative" if relative else "human"
-    return Task.of("pusht", steps, partial(make_env, relative), style=style, **ends)
+    play = Play(
+        partial(make_env, relative), success="is_success", measures={"coverage": "max"}, video_rate=10
+    )
+    return Task(demonstrations_of(steps, "pusht", style="relative" if relative else "human"), play=play)
 
 
 def relative(options: DataOptions) -> Task:

@@ -44,7 +44,7 @@ from warmprior import (
     policy_transforms,
     window_replay_buffer,
 )
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data import open_demonstrations
 from warmprior.deploy import export_policy, load_exported
 from warmprior.envs import RobosuiteEnv
 from warmprior.io.distributed import joined, rank
@@ -191,7 +191,7 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
             "observation.state": [i / fps for i in range(1 - TO, 1)],
         }
         dataset = LeRobotDataset(name, root=root, delta_timestamps=offsets)
-        demonstrations = LeRobotDemonstrations(root).data
+        demonstrations = open_demonstrations(f"lerobot:{root}").steps()
         buffer = window_replay_buffer(demonstrations, PRIOR, batch_size=BATCH, observation_steps=TO)
         ratio = clock.ratio(
             lambda: [dataset[i] for i in torch.randint(len(data), (64,)).tolist()],

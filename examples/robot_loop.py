@@ -212,7 +212,7 @@ def demonstrations(camera: bool, rate: float, episodes: int = 40, steps: int = 6
 
 
 def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
-    """Train a small policy, in a few seconds; a real one needs `joint_key` (docs/your_robot.md)."""
+    """Train a small policy, in a few seconds; a real one needs `joints` (docs/your_robot.md)."""
     seeing: dict[str, Any] = {"encoder": "small", "crop_size": 28} if camera else {}
     return train_policy(
         demonstrations(camera, rate),

@@ -15,7 +15,6 @@ DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
 SHOWN_ALONE = {
     "warmprior.saving.push_policy": "needs the hub",
-    "warmprior.data.MinariDemonstrations": "needs a dataset",
     "warmprior.data.observe_recordings": "needs a recording",
     "warmprior.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",

@@ -55,7 +55,7 @@ def robot(here, found):  # noqa: F811
 def dataset(here):
     widths = {"observation.environment_state": 16, "observation.state": 2, "action": 2}
     write_lerobot(here / "data", (20, 12), {name: numbers(width) for name, width in widths.items()})
-    return {"place": here / "data"}
+    return {"place": f"lerobot:{here / 'data'}"}
 
 
 @pytest.fixture

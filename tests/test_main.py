@@ -12,6 +12,7 @@ from warmprior.__main__ import main
 from warmprior.saving.policies import load_policy, save_policy
 
 pytest.importorskip("robosuite")
+from warmprior.data import open_demonstrations
 from warmprior.envs import TASKS, rendering_backend
 from warmprior.evaluation import play_episode
 from warmprior.tasks import Task
@@ -28,7 +29,7 @@ def saved(short_episodes, tmp_path_factory):
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
-    task, prior = Task.open(path), PastPrior(8)
+    task, prior = Task(open_demonstrations(path)), PastPrior(8)
     network = NetworkOptions(hidden_dim=16)
     actor = train_policy(task, prior, folder / "policy", network=network, training=training, description=None)
     env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
@@ -213,13 +214,13 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
 
     features = {name: numbers(width) for name, width in {"arm": 3, "cup": 2, "action": 4}.items()}
     write_lerobot(tmp_path / "cups", (12, 12), features)
-    words = f"train lerobot:{tmp_path / 'cups'} --observation-keys arm cup --iterations 2"
+    words = f"train lerobot:{tmp_path / 'cups'} --observations arm cup --iterations 2"
     assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
     actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     # Its actions are not near the arm; and of what it has, observations alone are named.
     for more, fact in (
-        *(("--joint-key arm", "cups"), ("--observation-keys leg", "leg")),
+        *(("--joints arm", "cups"), ("--observations leg", "leg")),
         ("--demonstrations 3", "demos=3"),
     ):
         said = refused([*words.split(), *more.split(), "--out", str(tmp_path / "out")], capsys)

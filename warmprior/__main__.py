@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +30,7 @@ from warmprior.saving.policies import (
     push_policy,
     save_policy,
 )
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
 from warmprior.training.option_text import make
@@ -258,13 +258,12 @@ def improve(
 
 @dataclass(frozen=True)
 class Data:
-    """The options of :meth:`Task.open`.
+    """The options of the demonstrations, and of the task that is learnt from them.
 
     Attributes:
-        observation_keys: observations of the policy, in this order; by default the task's
-        joint_key: observation of the joint positions that absolute actions target, such as
-            observation.state
-        image_keys: images of the policy, in addition to the robot's state, such as agentview_image
+        observations: observations of the policy, in this order; by default the task's
+        joints: observation of the joint positions that absolute actions target, such as observation.state
+        images: images of the policy, in addition to the robot's state, such as agentview_image
         fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
         mask: mask of the file, such as train, whose demonstrations to use; by default all
@@ -275,9 +274,9 @@ class Data:
         horizon: control steps per episode; by default the environment's own, or robosuite's for the style
     """
 
-    observation_keys: tuple[str, ...] | None = None
-    joint_key: str | None = None
-    image_keys: tuple[str, ...] = ()
+    observations: tuple[str, ...] | None = None
+    joints: str | None = None
+    images: tuple[str, ...] = ()
     fast_rendering: bool = False
     actions: Actions = "delta"
     mask: str | None = None
@@ -317,13 +316,23 @@ def train(
         out: folder of training runs, in which an interrupted one continues
         device: device of the network, such as cuda
     """
+    from warmprior.data import open_demonstrations
     from warmprior.envs.description import is_registered
 
     check_device(device)  # before the demonstrations are read
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
     sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
-    chosen = asdict(data)
-    whole = Task.open(place, demos=chosen.pop("demonstrations"), **chosen)
+    demonstrations = open_demonstrations(
+        place, demos=data.demonstrations, mask=data.mask, style=data.style, task=data.task
+    )
+    whole = Task(
+        demonstrations,
+        observations=data.observations,
+        images=data.images,
+        joints=data.joints,
+        actions=data.actions,
+        play=Play(horizon=data.horizon, fast_rendering=data.fast_rendering),
+    )
     recorded: Any = whole.environment
     playable = recorded is not None
     if is_registered(recorded) and recorded["gymnasium"]["success"] is None:
@@ -407,7 +416,7 @@ def convert(
     /,
     *,
     images: Literal["image", "video"] | None = None,
-    observation_keys: tuple[str, ...] | None = None,
+    observations: tuple[str, ...] | None = None,
     demonstrations: int | None = None,
 ) -> None:
     """Write a robomimic HDF5 file as a LeRobotDataset v3.
@@ -416,16 +425,12 @@ def convert(
         file: robomimic HDF5 file
         folder: folder to write, which must not exist
         images: include the file's images as lossless pictures (image), or as lossy, smaller videos (video)
-        observation_keys: observations to write; by default the task's
+        observations: observations to write; by default the task's
         demonstrations: number of demonstrations, from the first on; by default all
     """
     from warmprior.data import convert_robomimic
 
-    print(
-        convert_robomimic(
-            file, folder, images=images, observation_keys=observation_keys, demos=demonstrations
-        )
-    )
+    print(convert_robomimic(file, folder, images=images, observations=observations, demos=demonstrations))
 
 
 def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.data.formats.hdf5 import open_robomimic
-from warmprior.data.replay import DatasetError
+from warmprior.data.index import DatasetError
 from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require

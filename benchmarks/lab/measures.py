@@ -22,7 +22,7 @@ from lab.policies import Policy
 from lab.scripted.generate import generate_demonstrations
 from lab.source_errors import mean_error, source_coverage
 from lab.statistics import bootstrap_ratio
-from lab.tasks import demonstrations_of, read_like
+from lab.tasks import place_of, read_like
 from warmprior import Prior, WarmPriorActor
 from warmprior.diagnostics import (
     SharedObservations,
@@ -131,7 +131,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
     if validation is not None:
         place, words = validation, ""
     elif policy.data.mask == "train":
-        place, words, mask = demonstrations_of(policy.data, task.name, task.style)[0], "", "valid"
+        place, words, mask = place_of(policy.data, task.name, task.style)[0], "", "valid"
     elif facts.get("source") != "scripted":
         raise ValueError(
             f"the policies are trained on all of {facts['file']}: train them with --mask train, to measure "

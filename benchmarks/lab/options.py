@@ -23,7 +23,7 @@ from lab.tasks import (
     is_simulated,
     without_images,
 )
-from warmprior.data.demonstrations import name_of_place
+from warmprior.data import open_demonstrations
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import check_batch, launched
 from warmprior.modules.ode import Sampling
@@ -157,7 +157,7 @@ class Options:
     def name(self) -> str:
         """Return the name of the tasks, for folders."""
         file = self.data.dataset
-        tasks = self.data.task or ("square" if file is None else name_of_place(file),)
+        tasks = self.data.task or ("square" if file is None else open_demonstrations(file).title,)
         space = [] if self.data.actions == "delta" else [self.data.actions]
         observations = [] if self.data.obs == "state" else [self.data.obs]
         names = [task.replace(":", "-") for task in tasks]

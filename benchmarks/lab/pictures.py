@@ -68,7 +68,7 @@ def films(options: Options, policies: Sequence[Policy]) -> dict[str, Callable[[]
                 "No filmstrips: neither EGL nor OSMesa works here. Install one (on Debian or Ubuntu apt-get "
                 "install libegl1 libegl-mesa0, or libosmesa6)."
             )
-        elif first.environment is not None or first.video_rate is not None:
+        elif first.environment is not None or first.play.video_rate is not None:
             methods = labelled(pd.DataFrame([policy.facts for policy in of_task]))["method"]
             suffix = f"_{task}_{style}" if len(tasks) > 1 else ""
             for method, policy in dict(reversed([*zip(methods, of_task, strict=True)])).items():
@@ -95,7 +95,7 @@ def video(options: Options, policy: Policy, method: str, suffix: str) -> None:
     video = options.run.folder / f"video_{slug}{suffix}.mp4"
     env_options: dict[str, Any] = options.evaluation.environment
     if task.environment is None:
-        env_options = {"env": task.env(actor), "rate": task.video_rate, "success": task.success}
+        env_options = {"env": task.env(actor), "rate": task.play.video_rate, "success": task.play.success}
     strip = record_filmstrip(
         actor,
         seed=first,

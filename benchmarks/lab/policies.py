@@ -37,10 +37,10 @@ from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.checkpoint import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
-from warmprior.training.cloning import STATE_FORMAT, policy_path
+from warmprior.training.cloning import policy_path
 
 
 @dataclass(frozen=True)
@@ -155,19 +155,17 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     """Return the policy of another method on a task, with the options of the policy `like`."""
-    digest = digest_of(
+    identity = run_identity(
         task.identity,
         asdict(like.training),
-        method.config(),
-        asdict(like.network),
-        like.run.device,
-        like.run.compile,
-        version("torch"),
-        version("warmprior"),
-        STATE_FORMAT,
+        method=method.config(),
+        network=asdict(like.network),
+        device=like.run.device,
+        compile=like.run.compile,
+        versions={name: version(name) for name in ("torch", "warmprior")},
     )
     source = slug(",".join(filter(None, (method.name, method.options))))
-    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest[:10]}"
+    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest_of(identity)[:10]}"
     facts = {
         "task": task.name,
         "data": task.style,
@@ -311,7 +309,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
     """Play episodes; their noise depends on the seeds of policy and episode only."""
     actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
     task = policy.task()
-    outcome: dict[str, Any] = {"success": task.success, "measures": task.measures}
+    outcome: dict[str, Any] = {"success": task.play.success, "measures": task.play.measures}
     outcome |= {"nfe": cell.nfe, "policy_seed": policy.training.seed}
     return [play_episode(actor, env, episode, **outcome) for episode in seeds]
 

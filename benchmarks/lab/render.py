@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from lab.files import cache_folder
 from lab.workers import available_cores, working
-from warmprior.data.formats.hdf5 import member, open_robomimic, read_index, read_origin, reading
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
 from warmprior.data.images import StateRenderer, renderer_versions
-from warmprior.data.replay import DatasetError, DatasetIndex
+from warmprior.data.index import DatasetError, DatasetIndex
 from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, digest_of, exclusive, file_digest, write_atomic
@@ -71,7 +71,8 @@ def render_demonstrations(
             ...
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
-    path, index = Path(path), read_index(path, demos=demos)
+    demonstrations = RobomimicDemonstrations(path, demos=demos)
+    path, index = Path(path), demonstrations.index()
     if cameras is None:
         cameras = index.task.cameras if index.task else ("agentview", "robot0_eye_in_hand")
     cameras = tuple(cameras)
@@ -86,7 +87,7 @@ def render_demonstrations(
             f"size {size} is too large: the images of a demonstration need {needed / 1e9:.1f} GB of memory, "
             f"and {free / 1e9:.1f} GB are free"
         )
-    kept = _rendered_before(path, index, cameras, fast)
+    kept = _rendered_before(demonstrations, index, cameras, fast)
     chosen = [] if demos is None else [demos]
     identity = digest_of(*renderer_versions(), file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
@@ -165,16 +166,19 @@ class _Illustrator(StateRenderer):
         write_atomic(self.part(demo), write)
 
 
-def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool) -> list[str]:
+def _rendered_before(
+    demonstrations: RobomimicDemonstrations, index: DatasetIndex, cameras: Sequence[str], fast: bool
+) -> list[str]:
     """Return other cameras with images; raise ValueError if these have the other quality."""
-    before, _ = read_origin(path, index.demos[0])
+    before, _ = demonstrations.origin(index)
     if before is None:
         return []
     kept = [c for c in index.cameras if c in before["cameras"] and c not in cameras]
     if kept and bool(before["fast"]) != fast:
         raise ValueError(
-            f"{path}: its images of {', '.join(kept)} were rendered {'in full quality' if fast else 'fast'}, "
-            f"and a file has one quality: {'leave out' if fast else 'add'} --fast, or render all cameras "
+            f"{index.path}: its images of {', '.join(kept)} were rendered "
+            f"{'in full quality' if fast else 'fast'}, and a file has one quality: "
+            f"{'leave out' if fast else 'add'} --fast, or render all cameras "
             f"(--cameras {' '.join([*kept, *cameras])})"
         )
     return kept

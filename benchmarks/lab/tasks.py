@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
 from collections.abc import Mapping, Sequence
@@ -17,9 +18,9 @@ from lab.render import render_demonstrations
 from lab.scripted.generate import generate_demonstrations
 from lab.scripted.tasks import EXPERTS
 from warmprior.checks import check_whole_numbers
-from warmprior.data.demonstrations import LEROBOT, MINARI, dataset_name
-from warmprior.data.formats.lerobot_index import is_remote
-from warmprior.data.images import renderer_versions
+from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.images import check_images, renderer_versions
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
 from warmprior.envs.rendering import require_rendering
@@ -28,8 +29,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
 from warmprior.modules.encoder import imagenet_weights
-from warmprior.tasks import Task
-from warmprior.tasks.recorded import image_names, opened, read_steps, task_name
+from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions
 from warmprior.training.options import OF_IMAGES, PRETRAINED
 from warmprior.transforms.absolute_actions import Actions
@@ -61,8 +61,6 @@ def check_counts(options: Any, *names: str) -> None:
 def check_place(place: str | Path, option: str) -> None:
     """Check that a place may hold demonstrations; nothing is read or downloaded.
 
-    A place is an HDF5 file, ``lerobot:`` and a folder or repository, or ``minari:`` and a name.
-
     Raises:
         FileNotFoundError: if there is no such file or folder; it names the option.
         ImportError: if the package that reads it is not installed.
@@ -75,29 +73,15 @@ def check_place(place: str | Path, option: str) -> None:
             ...
         FileNotFoundError: --dataset lerobot:./square: no such folder, and no repository user/name of the hub
     """
-    if dataset_name(place, MINARI) is not None:
-        require("minari", "minari")
-        return
-    dataset = dataset_name(place, LEROBOT)
-    if dataset is None:
-        if not Path(place).is_file():
-            folder = (Path(place) / "meta" / "info.json").is_file()
-            hint = f"; for a LeRobotDataset write {LEROBOT}{place}" if folder else ""
-            raise FileNotFoundError(f"{option} {place}: no such file{hint}")
-        return
-    require("lerobot.datasets", "lerobot")
-    if not is_remote(dataset) and not Path(dataset).expanduser().is_dir():
-        raise FileNotFoundError(f"{option} {place}: no such folder, and no repository user/name of the hub")
+    try:
+        open_demonstrations(place).check()
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{option} {error}") from error
 
 
 def resolved_place(place: Path) -> str:
     """Return a place with an absolute path, so that it holds in any working directory."""
-    if dataset_name(place, MINARI) is not None:
-        return str(place)
-    dataset = dataset_name(place, LEROBOT)
-    if dataset is None:
-        return str(place.resolve())
-    return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
+    return open_demonstrations(place).resolved()
 
 
 @dataclass(frozen=True)
@@ -249,29 +233,25 @@ def check_network(network: NetworkOptions, data: DataOptions) -> None:
 
 def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOptions) -> Task:
     """Return the task of a file of demonstrations; ``source`` is scripted, official or file."""
-    # Only a file of the user's may have too many demonstrations, or be of an unknown task.
-    demos = None if source == "scripted" else options.first(style)
-    named = next(iter(options.task), None) if source == "file" else None
-    image_options: dict[str, Any] = {}
-    place = path
+    demonstrations = open_demonstrations(
+        path,
+        # Only a file of the user's may have too many demonstrations, or be of an unknown task.
+        demos=None if source == "scripted" else options.first(style),
+        mask=options.mask,
+        style=style,
+        task=next(iter(options.task), None) if source == "file" else None,
+    )
+    images: list[str] = []
+    pictured = demonstrations
     if options.obs == "image":
-        index = opened(path, named, options.mask).index(demos=demos)
+        index = demonstrations.index()
         cameras = options.cameras or (index.task.cameras if index.task else index.cameras)
         if not cameras:
             raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
-        size, fast = options.image_size, options.fast_rendering
-        place = with_images(path, named, cameras, size, fast, demos=demos, mask=options.mask)
-        image_options = {"image_keys": image_names(cameras), "fast_rendering": fast}
-    task = Task.open(
-        place,
-        task=named,
-        style=style,
-        actions=options.actions,
-        mask=options.mask,
-        demos=demos,
-        horizon=options.time_limit,
-        **image_options,
-    )
+        images = [f"{camera}_image" for camera in cameras]
+        pictured = with_images(demonstrations, cameras, options.image_size, options.fast_rendering)
+    play = Play(horizon=options.time_limit, fast_rendering=options.fast_rendering)
+    task = Task(pictured, images=images, actions=options.actions, play=play)
     if task.environment is None:
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
@@ -280,43 +260,39 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         )
     if "gymnasium" in task.environment:
         return task
-    facts, digest = task.facts | {"source": source}, task.digest
-    if place != path:  # the facts are those of the original file
-        original = opened(path)
-        facts |= {"file": original.name, "sha256": original.digest()}
-        digest = digest_of(facts["sha256"], demos, space_of(task), facts["images"], renderer_versions())
-    return replace(task, facts=facts, digest=digest)
+    task.facts["source"] = source
+    if pictured is not demonstrations:  # the facts are those of the original file
+        task.facts |= {"file": demonstrations.name, "sha256": demonstrations.digest(index)}
+        seen = space_of(task), task.facts["images"]
+        task.digest = digest_of(task.facts["sha256"], demonstrations.demos, *seen, renderer_versions())
+    return task
 
 
 def with_images(
-    place: Path | str,
-    task: str | None,
-    cameras: Sequence[str],
-    size: int,
-    fast: bool,
-    *,
-    demos: int | None = None,
-    mask: str | None = None,
-) -> Path | str:
-    """Return a place whose demonstrations have images: the given one, or a file rendered from it."""
-    opened_place = opened(place, task, mask)
-    index = opened_place.index(demos=demos)
+    demonstrations: Demonstrations, cameras: Sequence[str], size: int, fast: bool
+) -> Demonstrations:
+    """Return demonstrations with images: the given ones, or those of a file rendered from them."""
+    index = demonstrations.index()
     if set(cameras) <= set(index.cameras):
-        stored_size = opened_place.index(image_keys=image_names(cameras), demos=demos).image_size
+        stored_size = demonstrations.index(images=[f"{camera}_image" for camera in cameras]).image_size
         if stored_size != size:
             raise ValueError(
                 f"{index.path} has images of {stored_size} pixels: add --image-size {stored_size} (and a "
                 "smaller --crop-size), or render it again"
             )
-        return place
-    if str(place).startswith(LEROBOT):
-        return place  # its reader names the missing cameras
-    if mask is not None:
+        return demonstrations
+    if not isinstance(demonstrations, RobomimicDemonstrations):
+        return demonstrations  # its reader names the missing cameras
+    if demonstrations.mask is not None:
         raise ValueError(
-            f"{place} has no images of {', '.join(cameras)}, and files are rendered whole: render it first "
-            "(python benchmarks/demonstrations.py render), or leave the mask out"
+            f"{demonstrations} has no images of {', '.join(cameras)}, and files are rendered whole: render "
+            "it first (python benchmarks/demonstrations.py render), or leave the mask out"
         )
-    return render_demonstrations(place, cameras, size, demos=demos, fast=fast)
+    rendered = copy.copy(demonstrations)
+    rendered.place = render_demonstrations(
+        demonstrations.path, cameras, size, demos=demonstrations.demos, fast=fast
+    )
+    return rendered
 
 
 def read_like(
@@ -329,19 +305,24 @@ def read_like(
     Raises:
         ValueError: if the demonstrations are of another task.
     """
-    opened_place = opened(place, name, mask)
-    if (stored := task_name(opened_place.index())) != name:  # before images are rendered
+    demonstrations = open_demonstrations(place, mask=mask, task=name)
+    if (stored := demonstrations.index().task_name) != name:  # before images are rendered
         raise ValueError(f"{place} has demonstrations of {stored}, but the policies are for {name}")
-    images, called = facts.get("images"), opened_place.name
-    space: dict[str, Any] = {"observation_keys": facts.get("observation_keys")}
-    space |= {"absolute_actions": facts.get("actions") == "absolute"}
+    images, called = facts.get("images"), demonstrations.name
+    observations, pictures = facts.get("observation_keys"), []
     if images is not None:
-        place = with_images(
-            place, name, images["cameras"], images["size"], images["fast_rendering"], mask=mask
-        )
-        opened_place = opened(place, name, mask)
-        space |= {"cameras": images["cameras"], "fast_rendering": images["fast_rendering"]}
-    return read_steps(opened_place, **space)[0].data.exclude("next"), called
+        fast = images["fast_rendering"]
+        demonstrations = with_images(demonstrations, images["cameras"], images["size"], fast)
+        pictures = [f"{camera}_image" for camera in images["cameras"]]
+        observations = images["low_dim_keys"]
+        check_images(demonstrations, demonstrations.index(observations, pictures), fast)
+    steps = demonstrations.steps(
+        observations,
+        pictures,
+        actions=facts.get("actions", "delta"),
+        storage="memmap" if pictures else "memory",
+    )
+    return steps.exclude("next"), called
 
 
 def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
@@ -359,7 +340,9 @@ def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
         raise ValueError(f"the style of the toy is 'toy' or 'position', got {style!r}")
     octaves = 0 if style == "position" else OCTAVES
     make_env = partial(NavigationEnv, octaves=octaves)
-    return Task("navigation", style, navigation_demonstrations(octaves), make_env)
+    steps = navigation_demonstrations(octaves)
+    demonstrations = demonstrations_of(steps, "navigation", style=style, normalised=True)
+    return Task(demonstrations, play=Play(make_env))
 
 
 def load_task(options: DataOptions, name: str | None, style: str = "ph") -> Task:
@@ -391,11 +374,11 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph") -> Task
         if not isinstance(task, Task):
             raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
         return task
-    path, source = demonstrations_of(options, name, style)
+    path, source = place_of(options, name, style)
     return robosuite_task(path, style, source=source, options=options)
 
 
-def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
+def place_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
     """Return the file or dataset of a robosuite task, and its source; download or generate it if needed."""
     if options.dataset is not None:
         return options.dataset, "file"

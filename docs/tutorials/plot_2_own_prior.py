@@ -14,6 +14,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from warmprior import GaussianPrior, PastPrior, Prior, policy_transforms
+from warmprior.data import demonstrations_of
 from warmprior.diagnostics import (
     HistoryShift,
     SharedObservations,
@@ -25,7 +26,7 @@ from warmprior.envs import (
     navigation_metrics,
     navigation_positions,
 )
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 torch.manual_seed(0)
@@ -125,7 +126,10 @@ recipe = TrainingConfig(
     checkpoints=1,
     cold_probability=0.1,
 )
-task = Task("navigation", "toy", navigation_demonstrations(), NavigationEnv)
+demonstrations = demonstrations_of(
+    navigation_demonstrations(), "navigation", style="toy", normalised=True
+)
+task = Task(demonstrations, play=Play(NavigationEnv))
 actors = {}
 for name, prior in {"Gaussian": GaussianPrior(4), **priors}.items():
     actors[name] = train_policy(

@@ -33,7 +33,7 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations
+from warmprior.data import open_demonstrations
 from warmprior.evaluation import evaluate
 from warmprior.saving import load_policy
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
@@ -102,10 +102,7 @@ with h5py.File(root / "swing_up.hdf5", "w") as file:
         demo["rewards"] = episode["rewards"]
         demo["obs/state"] = episode["state"]
 
-replay = RobomimicDemonstrations(
-    root / "swing_up.hdf5", observation_keys=["state"]
-)
-demos = replay.data
+demos = open_demonstrations(root / "swing_up.hdf5").steps(["state"])
 print(demos.select("observation", "action", "episode"))
 
 # %%
@@ -137,7 +134,7 @@ for episode in episodes[:5]:
     dataset.save_episode()
 dataset.finalize()
 
-same = LeRobotDemonstrations(root / "lerobot").data
+same = open_demonstrations(f"lerobot:{root / 'lerobot'}").steps()
 first = demos[: len(same)]
 for key in ("observation", "action", "episode"):
     print(key, "is the same:", bool((same[key] == first[key]).all()))

@@ -10,7 +10,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from tests.benchmarks.script_parts import command_line
 from tests.toy_env import CountingEnv
 from warmprior import PastPrior
-from warmprior.tasks import Task
+from warmprior.data import demonstrations_of
+from warmprior.tasks import Play, Task
 
 H, OBSERVATION_DIM, ACTION_DIM = 4, 19, 7
 
@@ -55,10 +56,10 @@ def demonstrations(seed=0):
     return TensorDict({"observation": seen, "action": actions.tanh(), "episode": episode}, [75])
 
 
-def task(options=None, seed=0):
+def task(options=None, seed=0, name="drift", make_env=DriftEnv, success="solved"):
     """Named as ``--task tests.benchmarks.drift:task``."""
-    ends = {"success": "solved", "measures": {"side": "max"}}
-    return Task.of("drift", demonstrations(seed), DriftEnv, style="own", **ends)
+    play = Play(make_env, success=success, measures={"side": "max"})
+    return Task(demonstrations_of(demonstrations(seed), name, style="own"), play=play)
 
 
 drawn = count()
@@ -75,7 +76,7 @@ def other(options):
 
 def renamed(options):
     """The same as another task."""
-    return replace(task(options), name="Drift 2")
+    return task(options, name="Drift 2")
 
 
 class Broken(DriftEnv):
@@ -87,17 +88,17 @@ class Broken(DriftEnv):
 
 def mute(options):
     """With an environment that does not say whether it is solved."""
-    return replace(task(options), success="won")
+    return task(options, success="won")
 
 
 def narrow(options):
     data = demonstrations()
     data["observation"] = data["observation"][:, 1:]
-    return Task.of("drift", data, DriftEnv, style="own", success="solved")
+    return Task(demonstrations_of(data, "drift", style="own"), play=Play(DriftEnv, success="solved"))
 
 
 def broken(options):
-    return replace(task(options), make_env=Broken)
+    return task(options, make_env=Broken)
 
 
 class Widening(PastPrior, torch.nn.Module):

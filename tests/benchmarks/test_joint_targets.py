@@ -7,7 +7,7 @@ import torch
 from lab.scripted.generate import generate_demonstrations
 from lab.tasks import DataOptions
 from tests.processes import here
-from warmprior.data import convert_robomimic
+from warmprior.data import convert_robomimic, open_demonstrations
 from warmprior.envs.tasks import TaskSpec
 from warmprior.tasks import Task
 
@@ -38,6 +38,6 @@ def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
     assert joint_targets.demonstrations("ph", 1) == path  # recorded once
 
     pytest.importorskip("lerobot.datasets")
-    folder = convert_robomimic(path, tmp_path / "joints", observation_keys=joint_targets.OBSERVATION)
-    converted = Task.open(f"lerobot:{folder}", observation_keys=joint_targets.OBSERVATION)
+    folder = convert_robomimic(path, tmp_path / "joints", observations=joint_targets.OBSERVATION)
+    converted = Task(open_demonstrations(f"lerobot:{folder}"), observations=joint_targets.OBSERVATION)
     torch.testing.assert_close(converted.data["action"], task.data["action"])

@@ -19,10 +19,11 @@ from lab.tasks import DataOptions
 from tests.benchmarks import drift
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file
-from warmprior.data import RobomimicDemonstrations
+from warmprior.data import open_demonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.saving import load_policy
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -130,7 +131,7 @@ def test_every_budget_is_a_training_of_its_own(dataset, validation, tmp_path):
     # The errors are those of the policies on disk, each trained for its own number of iterations.
     for (n, _, nfe), row in cells.items():
         actor = load_policy(out.parent / "policies" / row["policy"] / f"policy_{n:06d}")
-        replay = RobomimicDemonstrations(validation).data.exclude("next")
+        replay = RobomimicDemonstrations(validation).steps().exclude("next")
         shared = SharedObservations(actor.normalizer.normalize(replay), 8, observation_steps=2)
         error = action_error(actor, shared.windows(actor.prior), nfes=(nfe,))[nfe]
         assert row["action_error"] == pytest.approx(error, rel=0.3)  # any draw of 20 is close
@@ -183,7 +184,9 @@ def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(minari, 
     else:
         place = tmp_path / "lift.hdf5"
         write_robomimic_file(place, lengths=(30, 5, 40), task="lift")
-        monkeypatch.setattr(drift, "task", lambda: Task.open(place, drift.DriftEnv))
+        monkeypatch.setattr(
+            drift, "task", lambda: Task(open_demonstrations(place), play=Play(drift.DriftEnv))
+        )
         more = {"task": f"{drift.__name__}:task"}
     out = tmp_path / "out"
     argv = drift.arguments(out, **more, seeds=1, episodes=None, nfe=None, observations=20)
@@ -195,14 +198,12 @@ def test_chosen_observations_are_read_from_held_out_demonstrations(tmp_path, mon
     path, other, keys = tmp_path / "lift.hdf5", tmp_path / "other.hdf5", ["robot0_eef_pos", "object"]
     write_robomimic_file(path, task="lift")
     write_robomimic_file(other, task="lift", seed=1)
-    monkeypatch.setattr(drift, "task", lambda: Task.open(path, observation_keys=keys))
+    monkeypatch.setattr(drift, "task", lambda: Task(open_demonstrations(path), observations=keys))
     data, run = DataOptions(task=(f"{drift.__name__}:task",)), Run(out=tmp_path)
     (policy,) = common.policies_of(Options(data, sources=Sources(prior=("past",)), run=run))
     measured, words = held_out(MeasuredOptions(data, validation=other, observations=20, run=run), policy)
     seen = policy.task().normalizer.denormalize(measured.data)["observation"]
-    torch.testing.assert_close(
-        seen, RobomimicDemonstrations(other, observation_keys=keys).data["observation"]
-    )
+    torch.testing.assert_close(seen, RobomimicDemonstrations(other).steps(observations=keys)["observation"])
     assert words == "other.hdf5"
 
 

@@ -16,7 +16,7 @@ from tests.data.synthetic import env_args_14, shortened, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 from tests.processes import apart, here
 from warmprior import ImageEncoder
-from warmprior.data import RobomimicDemonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
@@ -91,7 +91,7 @@ def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monk
     actor = load_policy(folder).eval()
     names = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
     cameras = ["agentview_image", "robot0_eye_in_hand_image"]
-    data = RobomimicDemonstrations(path, observation_keys=names, image_keys=cameras).data[:10]
+    data = RobomimicDemonstrations(path).steps(observations=names, images=cameras)[:10]
     data = actor.normalizer.normalize(data.exclude("next"))
     observation = torch.stack([data["observation"]] * 2, 1).auto_batch_size_(1)
     windows = data.select("action").set("observation", observation)

@@ -12,7 +12,9 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
 from tests.errors import raises
-from warmprior.data import DatasetError, LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
+from warmprior.data import DatasetError, convert_robomimic
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
 
 def with_images(path):
@@ -45,18 +47,22 @@ def equal(mine, theirs):
 
 OPTIONS = [
     {},
-    {"filter_key": "train", "demos": 1},
-    {"observation_keys": ["robot1_eef_pos", "object"]},
-    {"image_keys": ["robot0_eye_in_hand_image", "agentview_image"], "storage": "memmap"},
+    {"mask": "train", "demos": 1},
+    {"observations": ["robot1_eef_pos", "object"]},
+    {"images": ["robot0_eye_in_hand_image", "agentview_image"], "storage": "memmap"},
 ]
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_both_buffers_hold_the_same(converted, options):
     path, folders = converted
-    theirs = RobomimicDemonstrations(path, **options)
-    mine = LeRobotDemonstrations(folders["image"], **options)
-    assert not equal(mine.data, theirs.data)
+    opening = {name: value for name, value in options.items() if name in ("mask", "demos")}
+    read = {name: value for name, value in options.items() if name not in opening}
+    both = RobomimicDemonstrations(path, **opening), LeRobotDemonstrations(folders["image"], **opening)
+    theirs, mine = (demonstrations.steps(**read) for demonstrations in both)
+    assert not equal(mine, theirs)
+    seen = {name: value for name, value in read.items() if name in ("observations", "images")}
+    theirs, mine = (demonstrations.index(**seen) for demonstrations in both)
     for name in ("env_args", "task", "observation_keys", "image_size"):
         assert getattr(mine, name) == getattr(theirs, name)
 
@@ -65,7 +71,7 @@ def test_lerobot_reads_what_was_converted(converted):
     from lerobot.datasets import LeRobotDataset
 
     path, folders = converted
-    data = RobomimicDemonstrations(path).data
+    data = RobomimicDemonstrations(path).steps()
     for kind, folder in folders.items():
         dataset = LeRobotDataset("local/test", root=folder)
         assert dataset.fps == 20 and dataset.num_episodes == 3 and len(dataset) == 16
@@ -110,7 +116,7 @@ def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypat
     left.mkdir(parents=True)
     (left / "info.json").write_text("{")
     assert convert_robomimic(path, folder) == folder
-    assert len(LeRobotDemonstrations(folder)) == 16
+    assert len(LeRobotDemonstrations(folder).steps()) == 16
     assert [p.name for p in folder.parent.iterdir()] == ["data"]
 
 
@@ -132,15 +138,15 @@ def test_what_rewards_do_not_say_is_not_written(tmp_path, rewards):
     assert written == ({"next.reward", "next.success"} if rewards == "shaped" else set())
     if rewards == "shaped":
         assert [i for i in range(7) if dataset[i]["next.success"]] == [3, 6]
-    mine = LeRobotDemonstrations(tmp_path / "out").data
-    assert not equal(mine, RobomimicDemonstrations(path).data)
+    mine = LeRobotDemonstrations(tmp_path / "out").steps()
+    assert not equal(mine, RobomimicDemonstrations(path).steps())
 
 
 def test_a_mask_that_names_no_episode(converted, tmp_path):
     path, _ = converted
     folder = convert_robomimic(path, tmp_path / "out", demos=1)  # the mask valid is of the second
     with raises(DatasetError, "out", "mask", "valid"):
-        LeRobotDemonstrations(folder, filter_key="valid")
+        LeRobotDemonstrations(folder, mask="valid").steps()
 
 
 def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
@@ -150,11 +156,11 @@ def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
     parts["right"] = {"type": "JOINT_POSITION", "input_type": "absolute", "gripper": {"type": "GRIP"}}
     write_robomimic_file(path, task="lift", env_args=env_args)
     seen = ["robot0_gripper_qpos", "object"]
-    converted = convert_robomimic(path, tmp_path / "out", observation_keys=seen)
+    converted = convert_robomimic(path, tmp_path / "out", observations=seen)
     features = json.loads((converted / "meta" / "info.json").read_text())["features"]
     assert features["action"]["names"] is None
-    mine = LeRobotDemonstrations(converted, observation_keys=seen).data
-    assert not equal(mine, RobomimicDemonstrations(path, observation_keys=seen).data)
+    mine = LeRobotDemonstrations(converted).steps(observations=seen)
+    assert not equal(mine, RobomimicDemonstrations(path).steps(observations=seen))
 
 
 def test_what_cannot_be_converted(tmp_path):

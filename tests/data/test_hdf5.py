@@ -8,9 +8,8 @@ import torch
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import raises
-from warmprior.data import RobomimicDemonstrations
-from warmprior.data.formats.hdf5 import RobomimicReader, read_index
-from warmprior.data.replay import DatasetError
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
+from warmprior.data.index import DatasetError
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
@@ -26,12 +25,12 @@ def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
 def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
-    assert read_index(path, demos=11).demos == tuple(f"demo_{n}" for n in range(11))
-    assert read_index(path, demos=2, filter_key="late").demos == ("demo_3", "demo_10")
+    assert RobomimicDemonstrations(path, demos=11).index().demos == tuple(f"demo_{n}" for n in range(11))
+    assert RobomimicDemonstrations(path, demos=2, mask="late").index().demos == ("demo_3", "demo_10")
     with raises(DatasetError, "file.hdf5", 12, "demos=13"):
-        read_index(path, demos=13)
+        RobomimicDemonstrations(path, demos=13).index()
     with raises(ValueError, "demos", 0):
-        read_index(path, demos=0)
+        RobomimicDemonstrations(path, demos=0).index()
 
 
 def test_an_unknown_environment_has_what_it_finds(tmp_path):
@@ -49,39 +48,39 @@ def test_an_unknown_environment_has_what_it_finds(tmp_path):
             demo["obs/depth"] = np.zeros((steps, 4, 4, 1))
             demo["obs/language"] = np.array([b"open"] * steps)
             demo.create_group("obs/nested")
-    index = read_index(path)
+    index = RobomimicDemonstrations(path).index()
     assert index.task is None and index.action_dim == 14
     assert index.observation_keys == (
         *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
         *("robot1_eef_pos", "robot1_gripper_qpos", "robot2_eef_pos"),
         *("door_open", "robot3_right_eef_pos", "robot_goal"),
     )
-    assert (RobomimicDemonstrations(path).data["observation"][:, -2:] == 0.25).all()
+    assert (RobomimicDemonstrations(path).steps()["observation"][:, -2:] == 0.25).all()
     for nothing in [], ():
-        with raises(DatasetError, "file.hdf5", "observation_keys", "robot0_eef_pos"):
-            read_index(path, observation_keys=nothing)
+        with raises(DatasetError, "file.hdf5", "observations", "robot0_eef_pos"):
+            RobomimicDemonstrations(path).index(observations=nothing)
     with raises(ValueError, "file.hdf5", "['object', 'object']"):
-        read_index(path, observation_keys=["object", "object"])
+        RobomimicDemonstrations(path).index(observations=["object", "object"])
 
 
 def test_a_file_of_another_simulator_is_read_without_its_environment(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path, env_args={"env_name": "Isaac-Lift-v0", "type": 2})
-    assert read_index(path).env_args == {}
+    assert RobomimicDemonstrations(path).index().env_args == {}
 
 
 def test_files_without_rewards(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path)
-    with_rewards = RobomimicDemonstrations(path).data
+    with_rewards = RobomimicDemonstrations(path).steps()
     with h5py.File(path, "a") as file:
         del file["data/demo_1/rewards"]
     with raises(DatasetError, "file.hdf5", "data/demo_1", "data/demo_0", "'rewards'"):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
     with h5py.File(path, "a") as file:
         for number in (0, 2):
             del file[f"data/demo_{number}/rewards"]
-    data = RobomimicDemonstrations(path).data
+    data = RobomimicDemonstrations(path).steps()
     assert not data["next", "reward"].any() and not data["next", "terminated"].any()
     assert torch.equal(data["next", "truncated"], data["next", "done"])
     for key in ("observation", "action", "episode", ("next", "done")):
@@ -99,7 +98,7 @@ def test_a_shaped_reward_is_no_success_before_its_scale(tmp_path, kwargs, solved
     with h5py.File(path, "a") as file:
         file["data/demo_0/rewards"][...] = [0.1, 0.2, 0.5, 0.9]
         file["data/demo_1/rewards"][...] = [0.1, 0.5, 1.0]
-    data = RobomimicDemonstrations(path).data
+    data = RobomimicDemonstrations(path).steps()
     assert data["next", "terminated"][[3, 6], 0].tolist() == solved
     assert not (data["next", "terminated"] & data["next", "truncated"]).any()
 
@@ -111,12 +110,12 @@ def test_a_raw_recording_of_robosuite(tmp_path):
         for demo in file["data"].values():
             del demo["obs"], demo["rewards"], demo["dones"]
     with raises(DatasetError, "demo.hdf5", "data/demo_0", "'obs'", "states"):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
     with h5py.File(path, "a") as file:
         del file["data"].attrs["env_args"], file["data"].attrs["total"]
         file["data"].attrs["env"] = "NutAssemblySquare"
     with raises(DatasetError, "demo.hdf5", "'obs'", "states", "observe"):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
 
 
 def test_a_file_that_another_process_writes(square_file):
@@ -126,9 +125,9 @@ def test_a_file_that_another_process_writes(square_file):
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as other:
         assert other.stdout.readline() == "open\n"
         with raises(DatasetError, "square.hdf5", "HDF5_USE_FILE_LOCKING"):
-            read_index(path)
+            RobomimicDemonstrations(path).index()
         other.stdin.close()
-    read_index(path)
+    RobomimicDemonstrations(path).index()
 
 
 def test_a_flipped_bit_in_a_name(square_file):
@@ -139,7 +138,7 @@ def test_a_flipped_bit_in_a_name(square_file):
     with h5py.File(path) as file:
         assert list(file["data"]).count("demo_0") == 2
     with raises(DatasetError, "square.hdf5", "'demo_0'"):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
 
 
 def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
@@ -147,44 +146,48 @@ def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
     with h5py.File(path, "a") as file:
         del file["data/demo_1"]
     with raises(DatasetError, "square.hdf5", "data.attrs['total'] counts 47", "demos have 42"):
-        read_index(path)
-    assert len(read_index(path, filter_key="train").demos) == len(read_index(path, demos=2).demos) == 2
+        RobomimicDemonstrations(path).index()
+    assert (
+        len(RobomimicDemonstrations(path, mask="train").index().demos)
+        == len(RobomimicDemonstrations(path, demos=2).index().demos)
+        == 2
+    )
     with h5py.File(path, "a") as file:
         file["data"].attrs["total"] = "many"
     with raises(DatasetError, "square.hdf5", "data.attrs['total']"):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
     with h5py.File(path, "a") as file:
         del file["data"].attrs["total"]
-    assert len(read_index(path).demos) == 2
+    assert len(RobomimicDemonstrations(path).index().demos) == 2
 
 
 def test_what_is_no_file_or_not_whole(square_file, tmp_path):
     path, _ = square_file
     for place, error in ((tmp_path / "absent.hdf5", FileNotFoundError), (tmp_path, IsADirectoryError)):
         with raises(error, place):
-            read_index(place)
+            RobomimicDemonstrations(place).index()
     whole = path.read_bytes()
     parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
     for content in (*parts, b"<html>please log in"):
         path.write_bytes(content)
         with raises(DatasetError, "square.hdf5", "HDF5"):
-            read_index(path)
+            RobomimicDemonstrations(path).index()
 
 
 def test_filter_keys(square_file, tmp_path):
     path, _ = square_file
     with raises(DatasetError, "'better'", "empty, train, valid"):
-        read_index(path, filter_key="better")
+        RobomimicDemonstrations(path, mask="better").index()
     with raises(DatasetError, "mask/empty"):
-        read_index(path, filter_key="empty")
+        RobomimicDemonstrations(path, mask="empty").index()
     with h5py.File(path, "a") as file:
         del file["data/demo_2"]
     with raises(DatasetError, "mask/train", "demo_2"):
-        read_index(path, filter_key="train")
+        RobomimicDemonstrations(path, mask="train").index()
     bare = tmp_path / "bare.hdf5"
     write_robomimic_file(bare)
     with raises(DatasetError, "'train'", "none"):
-        read_index(bare, filter_key="train")
+        RobomimicDemonstrations(bare, mask="train").index()
 
 
 def test_corrupt_values(tmp_path):
@@ -199,6 +202,6 @@ def test_corrupt_values(tmp_path):
     with path.open("r+b") as raw:
         raw.seek(offset)
         raw.write(b"\x01\x02\x03")
-    read_index(path)
+    RobomimicDemonstrations(path).index()
     with h5py.File(path) as file, raises(DatasetError, "data/demo_0/actions"):
         RobomimicReader(file).numbers("demo_0", "actions", np.empty((12, 7)))

@@ -12,8 +12,8 @@ import pytest
 
 from tests.data.hdf5_faults import FAULTS, replace
 from tests.errors import raises
-from warmprior.data import DatasetError, RobomimicDemonstrations
-from warmprior.data.formats.hdf5 import read_index
+from warmprior.data import DatasetError
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 
 
 def replaced(name, value):
@@ -61,7 +61,7 @@ def test_no_recording_is_read_that_holds(square_file, tmp_path, fault):
     with h5py.File(path, "a") as file:
         FAULTS[fault](file, OBJECT, tmp_path)
     with raises(DatasetError, "square.hdf5", *NAMED.get(fault, [OBJECT])):
-        RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -71,7 +71,7 @@ def test_what_does_not_fit_is_refused_by_name(square_file, tmp_path, name):
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
     with raises(DatasetError, "square.hdf5", *facts):
-        read_index(path)
+        RobomimicDemonstrations(path).index()
 
 
 @pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
@@ -89,7 +89,7 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
     with raises(DatasetError, "square.hdf5", "data/demo_1/actions"):
-        RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
 
 
 def test_values_whose_storage_ends_before_they_do(square_file):
@@ -101,7 +101,7 @@ def test_values_whose_storage_ends_before_they_do(square_file):
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<2Q", place, 5 * 7 * 8 - 8)))
     with raises(DatasetError, "square.hdf5", "data/demo_1/actions", "never written"):
-        RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
 
 
 MASKS = {
@@ -123,17 +123,17 @@ def test_masks_of_another_kind(square_file, name):
         else:
             file["mask/train"] = mask
     with raises(DatasetError, "square.hdf5", "mask/train", fact):
-        read_index(path, filter_key="train")
+        RobomimicDemonstrations(path, mask="train").index()
 
 
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):
     path, _ = square_file
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
-    monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed - 1)
+    monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed - 1)
     with raises(DatasetError, "square.hdf5", 47, "memmap"):
-        RobomimicDemonstrations(path)
-    monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed)
-    RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
+    monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed)
+    RobomimicDemonstrations(path).steps()
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e39, -1e38, 1e10])
@@ -144,7 +144,7 @@ def test_values_that_no_robot_has(square_file, key, value):
     with h5py.File(path, "a") as file:
         file[f"data/demo_2/{key}"][17, ...] = value
     with raises(DatasetError, "square.hdf5", f"data/demo_2/{key}", "row 17"):
-        RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0.9, 0, 0, 0)])
@@ -152,9 +152,9 @@ def test_absolute_actions_need_unit_quaternions(square_file, quaternion):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         file["data/demo_1/obs/robot0_eef_quat"][3] = quaternion
-    RobomimicDemonstrations(path)
+    RobomimicDemonstrations(path).steps()
     with raises(DatasetError, "square.hdf5", "data/demo_1/obs/robot0_eef_quat", "row 3"):
-        RobomimicDemonstrations(path, absolute_actions=True)
+        RobomimicDemonstrations(path).steps(actions="absolute")
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -170,7 +170,7 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
 
     options = {"storage": "memmap", "scratch_dir": tmp_path / "maps" if named else None}
     monkeypatch.setattr(os, "posix_fallocate", count)
-    data = RobomimicDemonstrations(path, **options).data
+    data = RobomimicDemonstrations(path).steps(**options)
     sizes = [v.numel() * v.element_size() for v in data.values(True, True)]
     assert sorted(taken) == sorted(sizes)
 
@@ -182,6 +182,6 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
         "warmprior.data.formats.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled")
     )
     with raises(OSError, "GB", "scratch_dir"):
-        RobomimicDemonstrations(path, **options)
+        RobomimicDemonstrations(path).steps(**options)
     gc.collect()
     assert len(list(tmp_path.rglob("action.memmap"))) == named  # those of the data alone

@@ -9,9 +9,8 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.data import LeRobotDemonstrations
-from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.lerobot_index import action_names, read_lerobot_index, state_names
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.lerobot_index import action_names, state_names
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3
@@ -35,7 +34,7 @@ def test_windows_are_those_of_delta_timestamps(written):
         "observation.state": [i / 20 for i in range(1 - TO, 1)],
     }
     theirs = LeRobotDataset("local/test", root=root, delta_timestamps=deltas)
-    data = LeRobotDemonstrations(root, observation_keys=["observation.state"]).data
+    data = LeRobotDemonstrations(root).steps(observations=["observation.state"])
     windows = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=TO)
     prior = PastPrior(H)
     assert len(data) == len(theirs) == 16
@@ -57,8 +56,8 @@ def test_windows_are_those_of_delta_timestamps(written):
 def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
     root, values = written
     for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path}):
-        replay = LeRobotDemonstrations(root, env_args=env_args_15("lift"), **options)
-        data = replay.data
+        demonstrations = LeRobotDemonstrations(root, task=env_args_15("lift"))
+        data = demonstrations.steps(**options)
         state = np.concatenate([values[f"observation.{n}state"] for n in ("environment_", "")], -1)
         np.testing.assert_array_equal(data["observation"].numpy(), state)
         np.testing.assert_array_equal(data["action"].numpy(), values["action"])
@@ -67,10 +66,10 @@ def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
         assert data["next", "done"].squeeze(-1).nonzero().squeeze(-1).tolist() == [5, 6, 15]
         assert not data["next", "reward"].any() and not data["next", "terminated"].any()
         assert torch.equal(data["next", "truncated"], data["next", "done"])
-        assert replay.num_episodes == 3
-        assert replay.task is TASKS["lift"] and replay.path == root
-        assert replay.observation_keys == TASKS["lift"].low_dim_keys
-        assert replay.pose_columns.tolist() == [list(range(10, 17))]
+        index = demonstrations.index()
+        assert len(index.demos) == 3 and index.task is TASKS["lift"] and index.path == root
+        assert index.observation_keys == TASKS["lift"].low_dim_keys
+        assert index.pose_columns.tolist() == [list(range(10, 17))]
 
 
 def test_images_are_decoded_as_lerobot_does(written):
@@ -78,10 +77,9 @@ def test_images_are_decoded_as_lerobot_does(written):
 
     root, _ = written
     keys = ["agentview_image", "robot0_eye_in_hand_image"]
-    replay = LeRobotDemonstrations(root, image_keys=keys, storage="memmap")
+    observation = LeRobotDemonstrations(root).steps(images=keys, storage="memmap")["observation"]
     theirs = LeRobotDataset("local/test", root=root)
-    observation = replay.data["observation"]
-    assert replay.image_size == 32 and observation["state"].shape == (16, 19)
+    assert observation["state"].shape == (16, 19)
     for i in range(16):
         item, row = theirs[i], observation[i]
         for key in keys:
@@ -97,10 +95,10 @@ def test_cameras_whose_names_end_alike_are_told_apart(tmp_path):
     images = [("rgb.head", "image"), ("mask.head", "image"), ("wrist", "image")]
     write_lerobot(tmp_path / "data", (2,), images=images)
     cameras = [f"observation.images.{name}" for name, _ in images]
-    keys = Demonstrations(f"lerobot:{tmp_path / 'data'}").image_keys(cameras)
-    assert keys == ["rgb.head_image", "mask.head_image", "wrist_image"]
-    index = read_lerobot_index(tmp_path / "data", image_keys=keys)
-    assert list(index.images.values()) == cameras
+    keys = ("rgb.head_image", "mask.head_image", "wrist_image")
+    for named in (keys, cameras):
+        index = LeRobotDemonstrations(tmp_path / "data").index(images=named)
+        assert index.image_keys == keys and list(index.images.values()) == cameras
 
 
 KINDS = {"next.reward": numbers(1), "next.success": {"dtype": "bool", "shape": (1,), "names": None}}
@@ -111,7 +109,7 @@ def test_rewards_are_those_of_the_dataset_and_success_ends_an_episode(tmp_path, 
     """Recorded success tells the end, and no shaped reward beside it."""
     features = {name: numbers(w) for name, w in WIDTHS.items()} | {name: KINDS[name] for name in names}
     values = write_lerobot(tmp_path / "data", (4, 3, 5, 2), features)
-    data = LeRobotDemonstrations(tmp_path / "data").data["next"]
+    data = LeRobotDemonstrations(tmp_path / "data").steps()["next"]
     np.testing.assert_array_equal(data["reward"].numpy(), values[names[0]].astype(np.float32))
     last = [3, 6, 11, 13]
     won = torch.from_numpy(values[names[-1]] > 0)[last]
@@ -135,10 +133,10 @@ def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
         names["observation.state"] = state_names(TASKS["lift"].low_dim_widths)
     features = {name: numbers(width, names.get(name)) for name, width in widths.items()}
     values = write_lerobot(tmp_path / "data", features=features)
-    replay = LeRobotDemonstrations(tmp_path / "data", env_args=env_args_15("lift"))
+    demonstrations = LeRobotDemonstrations(tmp_path / "data", task=env_args_15("lift"))
     expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
-    np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
-    assert replay.observation_keys == TASKS["lift"].low_dim_keys
+    np.testing.assert_array_equal(demonstrations.steps()["observation"].numpy(), expected)
+    assert demonstrations.index().observation_keys == TASKS["lift"].low_dim_keys
 
 
 def test_features_of_width_1_and_of_truth_values(tmp_path):
@@ -150,7 +148,7 @@ def test_features_of_width_1_and_of_truth_values(tmp_path):
     }
     values = write_lerobot(tmp_path / "data", features=features)
     names = list(features)[:-1]
-    data = LeRobotDemonstrations(tmp_path / "data", observation_keys=names).data
+    data = LeRobotDemonstrations(tmp_path / "data").steps(observations=names)
     expected = np.concatenate([values[name].astype(np.float32) for name in names], -1)
     np.testing.assert_array_equal(data["observation"].numpy(), expected)
     np.testing.assert_array_equal(data["action"].numpy(), values["action"])

@@ -10,7 +10,8 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from tests.errors import raises
-from warmprior.data import DatasetError, LeRobotDemonstrations
+from warmprior.data import DatasetError
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.data.formats.lerobot_index import read_lerobot_index
 
 LIFT = env_args_15("lift")
@@ -167,29 +168,29 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
     if name in META:
         monkeypatch.setattr("warmprior.data.formats.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
     with raises(DatasetError, root / DATA if name in VALUES else root, *said):
-        LeRobotDemonstrations(root, env_args=LIFT, image_keys=keys)
+        LeRobotDemonstrations(root, task=LIFT).steps(images=keys)
 
 
 def test_masks_and_episodes_are_some_of_those_that_there_are(root):
     described(observations=STATE, masks={"none": [], "more": [0, 3], "floats": [0.5], "ok": [2, 0]})(root)
-    seen = {"observation_keys": ["observation.state"]}
-    for options in ({"filter_key": "none"}, {"episodes": []}, {"filter_key": "ok", "episodes": [1]}):
+    seen = {"observations": ["observation.state"]}
+    for options in ({"mask": "none"}, {"episodes": []}, {"mask": "ok", "episodes": [1]}):
         with raises(DatasetError, "mask"):
-            LeRobotDemonstrations(root, **options, **seen)
-    assert LeRobotDemonstrations(root, filter_key="ok", episodes=[2], **seen).num_episodes == 1
+            LeRobotDemonstrations(root, **options).steps(**seen)
+    assert LeRobotDemonstrations(root, mask="ok", episodes=[2]).index(**seen).demos == ("2",)
     for name in ("more", "floats"):
         with raises(DatasetError, f"'{name}'", "0 to 2"):
-            LeRobotDemonstrations(root, filter_key=name, **seen)
-    assert LeRobotDemonstrations(root, filter_key="ok", **seen).num_episodes == 2
+            LeRobotDemonstrations(root, mask=name).steps(**seen)
+    assert LeRobotDemonstrations(root, mask="ok").index(**seen).demos == ("0", "2")
     for numbers in ([3], [-1], [True], ["0"]):
         with raises(DatasetError, "episodes", "0 to 2"):
-            LeRobotDemonstrations(root, episodes=numbers, **seen)
+            LeRobotDemonstrations(root, episodes=numbers).steps(**seen)
 
 
 def test_files_of_other_episodes_are_not_needed(tmp_path):
     values = write_lerobot(tmp_path / "data", (12, 12, 12), data_files_size_in_mb=0.001)
     (tmp_path / "data/data/chunk-000/file-001.parquet").unlink()
-    data = LeRobotDemonstrations(tmp_path / "data", episodes=[2, 0]).data
+    data = LeRobotDemonstrations(tmp_path / "data", episodes=[2, 0]).steps()
     assert torch.equal(data["action"], torch.from_numpy(np.delete(values["action"], range(12, 24), 0)))
 
 
@@ -197,28 +198,28 @@ def test_files_of_other_episodes_are_not_needed(tmp_path):
 def test_observations_that_are_no_vectors_are_named(root, dtype, shape):
     feature("observation.state", dtype=dtype, shape=shape)(root)
     with raises(DatasetError, "'observation.state'", dtype, shape):
-        LeRobotDemonstrations(root, observation_keys=["observation.state"])
+        LeRobotDemonstrations(root).steps(observations=["observation.state"])
 
 
 def test_bad_options(root):
     with raises(ValueError, "'disk'"):
-        LeRobotDemonstrations(root, storage="disk")
+        LeRobotDemonstrations(root).steps(storage="disk")
     with raises(FileNotFoundError, "meta/info.json"):
-        LeRobotDemonstrations(root / "absent")
+        LeRobotDemonstrations(root / "absent").steps()
     with raises(DatasetError, 3, "demos=4"):
-        LeRobotDemonstrations(root, demos=4)
+        LeRobotDemonstrations(root, demos=4).steps()
     with raises(ValueError, "demos", 0):
-        LeRobotDemonstrations(root, demos=0)
+        LeRobotDemonstrations(root, demos=0).steps()
     with raises(DatasetError, "'nothing'", "observation.state"):
-        LeRobotDemonstrations(root, observation_keys=["nothing"])
-    with raises(DatasetError, "'observation.images.side'", "image_keys"):
-        LeRobotDemonstrations(root, observation_keys=["observation.images.side"])
+        LeRobotDemonstrations(root).steps(observations=["nothing"])
+    with raises(DatasetError, "'observation.images.side'", "images"):
+        LeRobotDemonstrations(root).steps(observations=["observation.images.side"])
     with raises(DatasetError, "observations"):
-        LeRobotDemonstrations(root, observation_keys=[])
+        LeRobotDemonstrations(root).steps(observations=[])
     with raises(DatasetError, "'train'", "none"):
-        LeRobotDemonstrations(root, filter_key="train")
+        LeRobotDemonstrations(root, mask="train").steps()
     with raises(DatasetError, "'robot0_eef_pos'"):
         read_lerobot_index(root, poses=True)
     # Poses that are none: random numbers where a quaternion should be.
     with raises(DatasetError, "robot0_eef_quat", "episode 0", "row"):
-        LeRobotDemonstrations(root, env_args=LIFT, absolute_actions=True)
+        LeRobotDemonstrations(root, task=LIFT).steps(actions="absolute")

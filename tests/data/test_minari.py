@@ -15,11 +15,11 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 from warmprior import PastPrior  # noqa: E402
 from warmprior.__main__ import main  # noqa: E402
-from warmprior.data import DatasetError, MinariDemonstrations  # noqa: E402
-from warmprior.data.demonstrations import Demonstrations  # noqa: E402
+from warmprior.data import DatasetError, open_demonstrations  # noqa: E402
+from warmprior.data.formats.minari import MinariDemonstrations  # noqa: E402
 from warmprior.envs import environment_of  # noqa: E402
 from warmprior.saving import load_policy  # noqa: E402
-from warmprior.tasks import Task  # noqa: E402
+from warmprior.tasks import Play, Task  # noqa: E402
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy  # noqa: E402
 
 LENGTHS = (7, 12, 5)
@@ -71,7 +71,7 @@ def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, success
 
 def test_steps_are_those_of_minari():
     name = written()
-    data = MinariDemonstrations(name).data
+    data = MinariDemonstrations(name).steps()
     assert data["episode"].tolist() == [i for i, n in enumerate(LENGTHS) for _ in range(n)]
     for i, episode in enumerate(minari.load_dataset(name).iterate_episodes()):
         mine = data[data["episode"] == i]
@@ -79,24 +79,23 @@ def test_steps_are_those_of_minari():
         np.testing.assert_array_equal(mine["action"], episode.actions)
         np.testing.assert_array_equal(mine["next", "reward"][:, 0], episode.rewards.astype(np.float32))
         np.testing.assert_array_equal(mine["next", "terminated"][:, 0], episode.terminations)
-    assert MinariDemonstrations(name, demos=2).num_episodes == 2
+    assert MinariDemonstrations(name, demos=2).index().demos == ("0", "1")
 
 
 def test_entries_of_dictionaries_are_chosen_by_name():
     name = written(observation=TREE)
     own = next(minari.load_dataset(name).iterate_episodes()).observations
-    chosen = {"observation_keys": ["goal/place", "arm"], "image_keys": ["front"]}
-    data = Demonstrations(f"minari:{name}").replay(**chosen).data[: LENGTHS[0]]
+    data = open_demonstrations(f"minari:{name}").steps(["goal/place", "arm"], ["front"])[: LENGTHS[0]]
     expected = np.concatenate([own["goal"]["place"], own["arm"]], -1)[:-1].astype(np.float32)
     np.testing.assert_array_equal(data["observation", "state"], expected)
     np.testing.assert_array_equal(data["observation", "front"], own["front"][:-1].transpose(0, 3, 1, 2))
-    assert MinariDemonstrations(name).observation_keys == ("arm", "goal/place")
+    assert MinariDemonstrations(name).index().observation_keys == ("arm", "goal/place")
     for wrong, facts in (
-        ({"observation_keys": ["leg"]}, ("leg", "arm, goal/place")),
-        ({"image_keys": ["side"]}, ("side", "front")),
+        ({"observations": ["leg"]}, ("leg", "arm, goal/place")),
+        ({"images": ["side"]}, ("side", "front")),
     ):
         with raises(DatasetError, *facts):
-            MinariDemonstrations(name, **wrong)
+            MinariDemonstrations(name).steps(**wrong)
 
 
 @pytest.mark.parametrize(
@@ -108,25 +107,25 @@ def test_entries_of_dictionaries_are_chosen_by_name():
 )
 def test_what_is_no_vector_is_refused(space, facts):
     with raises(DatasetError, *facts):
-        MinariDemonstrations(written(**space))
+        MinariDemonstrations(written(**space)).steps()
 
 
 def test_what_there_is_not(root):
     with raises(FileNotFoundError, "toy/none/human-v0", "MINARI_DATASETS_PATH"):
-        MinariDemonstrations("toy/none/human-v0")
+        MinariDemonstrations("toy/none/human-v0").steps()
     name = written()
-    for options in ({"filter_key": "train"}, {"absolute_actions": True}, {"demos": 4}):
+    for options, actions in (({"mask": "train"}, "delta"), ({}, "absolute"), ({"demos": 4}, "delta")):
         with pytest.raises(DatasetError):
-            MinariDemonstrations(name, **options)
+            MinariDemonstrations(name, **options).steps(actions=actions)
     (data,) = root.rglob("main_data.hdf5")
     data.write_bytes(data.read_bytes()[:900])
     with raises(DatasetError, "walk/human-v0"):
-        MinariDemonstrations(name)
+        MinariDemonstrations(name).steps()
 
 
 def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, capsys):
     name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
-    task = Task.open(f"minari:{name}", horizon=9)
+    task = Task(open_demonstrations(f"minari:{name}"), play=Play(horizon=9))
     small, short = NetworkOptions(hidden_dim=8), TrainingConfig(iterations=2)
     actor = train_policy(task, PastPrior(4), tmp_path / "run", nfe=1, network=small, training=short)
     assert actor.sampling.nfe == 1
@@ -140,16 +139,16 @@ def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, c
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["NFE 1", "NFE 3"]
     with pytest.warns(UserWarning, match="Pendulum-v1 has no time limit.*horizon"):
-        Task.open(f"minari:{name}", horizon=-1).make_env()
+        Task(open_demonstrations(f"minari:{name}"), play=Play(horizon=-1)).make_env()
 
 
 def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
     place = f"minari:{written(observation=TREE)}"
-    options = ["--observation-keys", "arm", "--iterations", "2", "--hidden-dim", "8", "--held-out", "1"]
+    options = ["--observations", "arm", "--iterations", "2", "--hidden-dim", "8", "--held-out", "1"]
     assert not main(["train", place, "--out", str(tmp_path), "--nfe", "1", *options])
     said = capsys.readouterr().out
     assert "(1)" in said and "NFE 1" in said and "NFE 9" in said
-    task = Task.open(place)
+    task = Task(open_demonstrations(place))
     with raises(ValueError, "environment"):
         task.make_env()
 
@@ -169,11 +168,11 @@ def test_nothing_named_in_a_dataset_is_imported(root):
     text = metadata.read_text()
     for other in ("evil-v1", "evil:Pendulum-v1"):
         metadata.write_text(text.replace("Pendulum-v1", other))
-        task = Task.open(f"minari:{name}")
+        task = Task(open_demonstrations(f"minari:{name}"))
         with raises(ImportError, other):
             task.make_env()
     entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
     assert entry in text
     metadata.write_text(text.replace(entry, "evil:Env"))  # the registry's own is built
-    assert isinstance(Task.open(f"minari:{name}").make_env(), torch.nn.Module)
+    assert isinstance(Task(open_demonstrations(f"minari:{name}")).make_env(), torch.nn.Module)
     assert gymnasium.registry["Pendulum-v1"].entry_point == entry

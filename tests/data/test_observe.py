@@ -13,7 +13,8 @@ h5py = pytest.importorskip("h5py")
 pytest.importorskip("robosuite")
 
 from warmprior.__main__ import main  # noqa: E402
-from warmprior.data import DatasetError, RobomimicDemonstrations, observe_recordings  # noqa: E402
+from warmprior.data import DatasetError, observe_recordings, open_demonstrations  # noqa: E402
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations  # noqa: E402
 from warmprior.tasks import Task  # noqa: E402
 
 
@@ -42,21 +43,22 @@ def test_observations_are_those_of_the_states(raw, lift_demonstrations, tmp_path
     out = tmp_path / "lift.hdf5"
     assert main(["observe", str(raw), str(out), "--demonstrations", "2"]) == 0
     assert capsys.readouterr().out.strip() == str(out)
-    found = RobomimicDemonstrations(out)
-    expected = RobomimicDemonstrations(lift_demonstrations, demos=2)
-    assert found.task == expected.task and found.observation_keys == expected.observation_keys
+    both = RobomimicDemonstrations(out), RobomimicDemonstrations(lift_demonstrations, demos=2)
+    (found, expected), indices = ([d.steps() for d in both], [d.index() for d in both])
+    for fact in ("task", "observation_keys"):
+        assert getattr(indices[0], fact) == getattr(indices[1], fact)
     # Sensors of objects relative to the gripper read what the control step before has cached.
-    np.testing.assert_allclose(found.data["observation"], expected.data["observation"], atol=2e-3)
-    np.testing.assert_array_equal(found.data["action"], expected.data["action"])
-    rewards = [buffer.data["next", "reward"].flatten() for buffer in (found, expected)]
+    np.testing.assert_allclose(found["observation"], expected["observation"], atol=2e-3)
+    np.testing.assert_array_equal(found["action"], expected["action"])
+    rewards = [data["next", "reward"].flatten() for data in (found, expected)]
     assert (rewards[0] != rewards[1]).float().mean() < 0.02  # within a step of the same moment
-    task = Task.open(out)
+    task = Task(open_demonstrations(out))
     assert task.name == "lift" and task.facts["demonstrations"] == 2
 
 
 def test_what_cannot_be_replayed_says_so(raw, tmp_path):
     with raises(DatasetError, "observe"):
-        RobomimicDemonstrations(raw)
+        RobomimicDemonstrations(raw).steps()
     taken = tmp_path / "taken.hdf5"
     taken.touch()
     with raises(FileExistsError, "taken.hdf5"):
@@ -96,14 +98,14 @@ def test_a_robot_without_a_simulator(tmp_path, capsys):
             demo.create_dataset("obs/joints", data=rng.normal(size=(n, 5)))
             demo.create_dataset("obs/gripper", data=rng.normal(size=(n, 1)))
             demo.create_dataset("obs/wrist_image", data=rng.integers(0, 255, (n, 24, 24, 3), dtype=np.uint8))
-    task = Task.open(path, observation_keys=["joints", "gripper"], image_keys=["wrist_image"])
+    task = Task(open_demonstrations(path), observations=["joints", "gripper"], images=["wrist_image"])
     assert task.images == {"wrist_image": 24} and task.vector.shape == (95, 6)
     argv = ["train", str(path), "--out", str(tmp_path / "out"), "--iterations", "2", "--hidden-dim", "8"]
-    chosen = ["--observation-keys", "joints", "gripper", "--held-out", "1"]
+    chosen = ["--observations", "joints", "gripper", "--held-out", "1"]
     assert main([*argv, *chosen]) == 0
     assert "(1)" in capsys.readouterr().out
-    seen = ["--image-keys", "wrist_image", "--encoder", "small", "--crop-size", "20"]
+    seen = ["--images", "wrist_image", "--encoder", "small", "--crop-size", "20"]
     assert main([*argv, *chosen, *seen, "--out", str(tmp_path / "seen")]) == 0
-    for wrong in (["--observation-keys", "legs"], ["--image-keys", "front_image"]):
+    for wrong in (["--observations", "legs"], ["--images", "front_image"]):
         assert main([*argv, *wrong]) == 2
         assert "legs" in (said := capsys.readouterr().err) or "front_image" in said

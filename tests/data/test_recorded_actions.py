@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
 from tests.errors import raises
-from warmprior.data import DatasetError, RobomimicDemonstrations, convert_robomimic
-from warmprior.envs import delta_conventions
+from warmprior.data import DatasetError, convert_robomimic
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.envs import delta_conventions, modernize_env_args
 
 HAND_TO_SITE = Rotation.from_euler("z", -90, degrees=True)
 BASE = np.array([-0.56, 0.0, 0.912])
@@ -69,8 +70,8 @@ KINDS = ("scripted", "keyboard", "slow", "resting")
 def test_deltas_are_read_as_deltas(tmp_path, kind, task):
     path = tmp_path / "low_dim.hdf5"
     expected = write(path, kind, task=task)
-    assert torch.equal(RobomimicDemonstrations(path).data["action"], expected["delta"])
-    found = RobomimicDemonstrations(path, absolute_actions=True).data["action"]
+    assert torch.equal(RobomimicDemonstrations(path).steps()["action"], expected["delta"])
+    found = RobomimicDemonstrations(path).steps(actions="absolute")["action"]
     torch.testing.assert_close(found, expected["absolute"], atol=1e-5, rtol=0)
 
 
@@ -79,17 +80,18 @@ def test_deltas_are_read_as_deltas(tmp_path, kind, task):
 def test_poses_declared_as_deltas(tmp_path, kind, task):
     path = tmp_path / "low_dim_abs.hdf5"
     expected = write(path, kind, "rotvec", task)
-    with raises(DatasetError, "low_dim_abs.hdf5", "absolute_actions=True", "control_delta"):
-        RobomimicDemonstrations(path)
-    replay = RobomimicDemonstrations(path, absolute_actions=True)
-    torch.testing.assert_close(replay.data["action"], expected["absolute"], atol=1e-5, rtol=0)
-    delta_conventions(replay.env_args)  # an environment of deltas, towards these poses
+    with raises(DatasetError, "low_dim_abs.hdf5", "actions='absolute'", "control_delta"):
+        RobomimicDemonstrations(path).steps()
+    action = RobomimicDemonstrations(path).steps(actions="absolute")["action"]
+    torch.testing.assert_close(action, expected["absolute"], atol=1e-5, rtol=0)
+    # An environment of deltas, towards these poses.
+    delta_conventions(modernize_env_args(RobomimicDemonstrations(path).index().env_args))
     # Whatever observations are chosen.
-    other = RobomimicDemonstrations(path, absolute_actions=True, observation_keys=["object"])
-    assert torch.equal(other.data["action"], replay.data["action"])
+    other = RobomimicDemonstrations(path).steps(actions="absolute", observations=["object"])
+    assert torch.equal(other["action"], action)
     with h5py.File(path) as file:
         recorded = np.concatenate([file[f"data/demo_{n}/actions"] for n in (0, 1)])
-    as_recorded = RobomimicDemonstrations(path, as_recorded=True).data["action"]
+    as_recorded = RobomimicDemonstrations(path).steps(actions="stored")["action"]
     np.testing.assert_array_equal(as_recorded.numpy(), recorded.astype(np.float32))
 
 
@@ -97,12 +99,12 @@ def test_poses_declared_as_poses(tmp_path):
     path, env_args = tmp_path / "file.hdf5", env_args_14("lift")
     env_args["env_kwargs"]["controller_configs"]["control_delta"] = False
     write(path, stored="rotvec", env_args=env_args)
-    assert RobomimicDemonstrations(path).data["action"].shape == (65, 7)
+    assert RobomimicDemonstrations(path).steps()["action"].shape == (65, 7)
     with raises(DatasetError, "file.hdf5", "env_args", "absolute"):
-        RobomimicDemonstrations(path, absolute_actions=True)
+        RobomimicDemonstrations(path).steps(actions="absolute")
     write(path, stored="delta", env_args=env_args)
     with raises(DatasetError, "file.hdf5", "robot0_eef_pos", "control_delta"):
-        RobomimicDemonstrations(path)
+        RobomimicDemonstrations(path).steps()
 
 
 def test_poses_in_the_frame_of_the_base(tmp_path):
@@ -110,16 +112,16 @@ def test_poses_in_the_frame_of_the_base(tmp_path):
     write(path, stored="base", env_args=env_args_15("lift"))
     for absolute in (False, True):
         with raises(DatasetError, "file.hdf5", "robot0_eef_pos", "input_ref_frame"):
-            RobomimicDemonstrations(path, absolute_actions=absolute)
+            RobomimicDemonstrations(path).steps(actions="absolute" if absolute else "delta")
 
 
 def test_a_converted_file_tells_the_same(tmp_path):
     pytest.importorskip("lerobot")
-    from warmprior.data import LeRobotDemonstrations
+    from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
     expected = write(tmp_path / "low_dim_abs.hdf5", stored="rotvec")
     folder = convert_robomimic(tmp_path / "low_dim_abs.hdf5", tmp_path / "converted")
-    with raises(DatasetError, "converted", "absolute_actions=True"):
-        LeRobotDemonstrations(folder)
-    found = LeRobotDemonstrations(folder, absolute_actions=True).data["action"]
+    with raises(DatasetError, "converted", "actions='absolute'"):
+        LeRobotDemonstrations(folder).steps()
+    found = LeRobotDemonstrations(folder).steps(actions="absolute")["action"]
     torch.testing.assert_close(found, expected["absolute"], atol=1e-5, rtol=0)

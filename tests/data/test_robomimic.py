@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SliceSampler
+from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.errors import missing
 from tests.processes import apart
-from warmprior.data import RobomimicDemonstrations
-from warmprior.envs import absolute_actions, modernize_env_args
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.envs import absolute_actions
 from warmprior.envs.tasks import TASKS
 
 
@@ -27,9 +28,9 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
     path = tmp_path / "file.hdf5"
     demos = write_robomimic_file(path, lengths=(12, 1, 30), task=task, failures=(2,))
     scratch = tmp_path / "scratch" if task == "lift" else None
-    replay = RobomimicDemonstrations(path, storage=storage, scratch_dir=scratch)
-    data = replay.data
-    assert data.batch_size == (43,) and len(replay) == 43
+    demonstrations = RobomimicDemonstrations(path)
+    data = demonstrations.steps(storage=storage, scratch_dir=scratch)
+    assert data.batch_size == (43,)
     expected = {
         "observation": np.concatenate([_state(demo, task) for demo in demos]),
         "action": np.concatenate([demo["actions"] for demo in demos]),
@@ -49,10 +50,12 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
         *("observation", "action", "episode", "frame"),
         *(("next", key) for key in ("reward", "done", "terminated", "truncated")),
     }
-    assert replay.num_episodes == 3 and replay.data["episode"].bincount().tolist() == [12, 1, 30]
-    assert replay.task is TASKS[task] and replay.path == path
-    assert replay.observation_keys == TASKS[task].low_dim_keys
-    assert replay.env_args == modernize_env_args(env_args_15(task))
+    assert data["episode"].bincount().tolist() == [12, 1, 30]
+    index = demonstrations.index()
+    assert index.task is TASKS[task] and index.path == path and index.lengths == (12, 1, 30)
+    assert index.observation_keys == TASKS[task].low_dim_keys
+    assert index.env_args == env_args_15(task)
+    assert not missing(repr(demonstrations), "3 demonstrations", "43 steps", "object", TASKS[task].env_name)
 
 
 def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
@@ -60,19 +63,18 @@ def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     mapped = {"storage": "memmap"}
     maps = mapped | {"scratch_dir": tmp_path / "maps"}
-    replays = [RobomimicDemonstrations(path, batch_size=7, **options) for options in ({}, mapped, maps, maps)]
-    for number, replay in enumerate(replays):
-        assert replay.data["action"].data_ptr() == replay.data["action"].data_ptr()
-        replay.data["action"].fill_(number)
-    for number, replay in enumerate(replays):  # two have their files in one folder
-        assert (replay.sample()["action"] == number).all()
-    sent = [pickle.loads(pickle.dumps(replay.data)) for replay in replays]  # as to a worker process
+    read = [RobomimicDemonstrations(path).steps(**options) for options in ({}, mapped, maps, maps)]
+    for number, data in enumerate(read):
+        data["action"].fill_(number)
+    for number, data in enumerate(read):  # two have their files in one folder
+        assert (data["action"] == number).all()
+    sent = [pickle.loads(pickle.dumps(data)) for data in read]  # as to a worker process
     assert [data["action"].unique().tolist() for data in sent] == [[0], [1], [2], [3]]
-    apart(lambda: sent.append(RobomimicDemonstrations(path, **mapped)))()  # a worker leaves nothing
+    apart(lambda: sent.append(RobomimicDemonstrations(path).steps(**mapped)))()  # a worker leaves nothing
     files = sorted(tmp_path.rglob("action.memmap"))
     assert [file.parents[1] for file in files] == [tmp_path / "maps"] * 2 + [tmp_path]
-    part = replays[-1].data[:1].select("action")
-    del replay, replays
+    part = read[-1][:1].select("action")
+    del data, read
     gc.collect()
     assert len(list(tmp_path.rglob("action.memmap"))) == 1 and (part["action"] == 3).all()
     del part
@@ -81,8 +83,8 @@ def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):
     path, _ = square_file
-    replay = RobomimicDemonstrations(
-        path,
+    replay = TensorDictReplayBuffer(
+        storage=TensorStorage(RobomimicDemonstrations(path).steps()),
         batch_size=20,
         sampler=SliceSampler(slice_len=5, end_key=("next", "done")),
         transform=RenameTransform(["observation"], ["state"]),
@@ -97,21 +99,19 @@ def test_absolute_actions_of_deltas_in_the_frame_of_the_base(tmp_path):
     """The two bases of transport face each other along y."""
     path, meta = tmp_path / "file.hdf5", env_args_15("transport", "base")
     demos = write_robomimic_file(path, task="transport", env_args=meta)
-    replay = RobomimicDemonstrations(path, absolute_actions=True)
+    data = RobomimicDemonstrations(path).steps(actions="absolute")
     poses = [
         np.concatenate([demos[1][f"robot{a}_{key}"] for a in (0, 1)], -1) for key in ("eef_pos", "eef_quat")
     ]
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     base = torch.stack((quarter, quarter.mT))
     expected = absolute_actions(*map(torch.from_numpy, (demos[1]["actions"], *poses)), base_rotation=base)
-    torch.testing.assert_close(replay.data["action"][12:17], expected.float())
-    replay.env_args["env_kwargs"].clear()
-    assert replay.env_args["env_kwargs"]
+    torch.testing.assert_close(data["action"][12:17], expected.float())
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's /proc")
 @pytest.mark.slow
-@pytest.mark.parametrize("options", ["", "absolute_actions=True", "storage='memmap'"])
+@pytest.mark.parametrize("options", ["", "actions='absolute'", "storage='memmap'"])
 def test_peak_memory(tmp_path, options):
     small, large = tmp_path / "small.hdf5", tmp_path / "large.hdf5"
     write_robomimic_file(small)
@@ -119,14 +119,14 @@ def test_peak_memory(tmp_path, options):
     code = f"""
         import re, sys
         from pathlib import Path
-        from warmprior.data import RobomimicDemonstrations
+        from warmprior.data.formats.hdf5 import RobomimicDemonstrations
         # What is imported or cached on first use is not the data's.
-        RobomimicDemonstrations(sys.argv[1], {options})
+        RobomimicDemonstrations(sys.argv[1]).steps({options})
         status = lambda key: 1024 * int(
             re.search(key + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]
         )
         before = status("VmRSS")
-        data = RobomimicDemonstrations(sys.argv[2], {options}).data
+        data = RobomimicDemonstrations(sys.argv[2]).steps({options})
         size = sum(v.numel() * v.element_size() for v in data.values(True, True))
         print((status("VmHWM") - before) / size, size)
     """

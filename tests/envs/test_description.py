@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
 from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
-from warmprior.data import RobomimicDemonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
 from warmprior.envs.description import environment_name, robosuite_parts
 from warmprior.envs.simulator import task_env_args
@@ -70,16 +70,17 @@ def solved(path, actions):
     """Which recorded demonstrations solve the task again, from the start that their seed gives."""
     import h5py
 
-    data = RobomimicDemonstrations(path, absolute_actions=actions == "absolute")
-    make_env, adapters = robosuite_parts(environment_description(data.env_args, "ph", actions))
+    data = RobomimicDemonstrations(path).steps(actions=actions)
+    env_args = RobomimicDemonstrations(path).index().env_args
+    make_env, adapters = robosuite_parts(environment_description(env_args, "ph", actions))
     env = TransformedEnv(make_env(), Compose(*adapters.values()))
     outcomes = []
     with h5py.File(path) as file:
-        seeds = [file[f"data/demo_{i}"].attrs["seed"] for i in range(data.num_episodes)]
+        seeds = [file[f"data/demo_{i}"].attrs["seed"] for i in data["episode"].unique()]
     for episode, seed in enumerate(seeds):
         env.set_seed(int(seed), static_seed=True)
         td = env.reset()
-        for action in data.data["action"][data.data["episode"] == episode]:
+        for action in data["action"][data["episode"] == episode]:
             td = env.step(td.set("action", action))["next"]
             if td["done"]:
                 break

@@ -31,10 +31,11 @@ from warmprior import (
     normalizing_transforms,
     policy_transforms,
 )
+from warmprior.data import demonstrations_of
 from warmprior.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.evaluation.parallel import watched
 from warmprior.io.workers import WorkerError
-from warmprior.tasks import Task
+from warmprior.tasks import Play, Task
 
 H = 3
 
@@ -388,6 +389,9 @@ def test_policy_and_environment_need_one_normaliser():
 @pytest.mark.parametrize("given", [{"success": "solved"}, {"measures": {"reward": "sum"}}])
 def test_a_task_has_its_own_success_and_measures(given):
     rows = TensorDict({"observation": torch.rand(9, 1), "action": torch.rand(9, ACTION_DIM)}, [9])
-    task = Task.of("own", rows.set("episode", torch.zeros(9, dtype=torch.int64)), CountingEnv)
+    task = Task(
+        demonstrations_of(rows.set("episode", torch.zeros(9, dtype=torch.int64)), "own"),
+        play=Play(CountingEnv),
+    )
     with raises(ValueError, next(iter(given))):
         evaluate(mlp_actor(PastPrior(4)), task, episodes=1, first_seed=0, **given)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 pytest.importorskip("robosuite")
 pytest.importorskip("pyarrow")
@@ -36,8 +36,9 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.data import LeRobotDemonstrations, RobomimicDemonstrations, convert_robomimic
-from warmprior.envs import modernize_env_args
+from warmprior.data import convert_robomimic
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.saving.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.saving.policies import load_policy, policy_config, save_policy
@@ -153,41 +154,43 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
                 name = f"data/demo_{rng.choice([0, 2])}/{rng.choice(NUMBERS)}"
                 how, must_refuse = f"{fault} {name}", True
                 FAULTS[fault](file, name, folder)
-    options = {"filter_key": "train" if masked else None, "absolute_actions": bool(rng.random() < 0.3)}
+    mask, actions = "train" if masked else None, "absolute" if rng.random() < 0.3 else "delta"
 
     def load() -> Outcome:
-        replay = RobomimicDemonstrations(path, **options)
+        read = RobomimicDemonstrations(path, mask=mask)
+        data = read.steps(actions=actions)
         if must_refuse:
             return Outcome("silent", "was read")
-        expected = RobomimicDemonstrations(whole, **options)
-        equal = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
-        if equal and replay.env_args == expected.env_args:
+        undamaged = RobomimicDemonstrations(whole, mask=mask)
+        expected = undamaged.steps(actions=actions)
+        equal = data.shape == expected.shape and bool((data == expected).all())
+        if equal and read.index().env_args == undamaged.index().env_args:
             return Outcome("equal")
         # HDF5 keeps no checksum of plain values: then the file must say so to any reader.
-        return Outcome("as stored") if _says_so(path, replay, options) else Outcome("silent", "differs")
+        return Outcome("as stored") if _says_so(read, data, actions) else Outcome("silent", "differs")
 
     return how, load, str(path)
 
 
-def _says_so(path: Path, replay: RobomimicDemonstrations, options: dict) -> bool:
+def _says_so(read: RobomimicDemonstrations, data: TensorDictBase, actions: str) -> bool:
     """Whether h5py alone reads the same."""
-    with h5py.File(path) as file:
+    index = read.index()
+    with h5py.File(read.path) as file:
         demos = sorted(file["data"], key=lambda name: int(name[5:]))
-        if options["filter_key"]:
+        if read.mask:
             demos = [demo for demo in demos if demo.encode() in set(file["mask/train"][()])]
         values = [
-            np.concatenate([file[f"data/{demo}/obs/{key}"][()] for key in replay.observation_keys], -1)
+            np.concatenate([file[f"data/{demo}/obs/{key}"][()] for key in index.observation_keys], -1)
             for demo in demos
         ]
         actions = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
-        rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
         meta = json.loads(file["data"].attrs["env_args"])
-    data = replay.data
+        rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
     pairs = [(data["observation"], np.concatenate(values)), (data["next", "reward"][:, 0], rewards)]
-    if not options["absolute_actions"]:
+    if actions == "delta":
         pairs.append((data["action"], actions))
     equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
-    return equal and replay.env_args == modernize_env_args(meta)
+    return equal and index.env_args == meta
 
 
 def make_datasets(folder: Path) -> None:
@@ -206,37 +209,39 @@ def mutate_datasets(folder: Path, rng: np.random.Generator) -> Case:
     files = sorted(p for p in case.rglob("*") if p.is_file() and p.name not in unread)
     path = files[int(rng.integers(len(files)))]
     how = damage_content(path, rng)
-    options = {"filter_key": "train" if rng.random() < 0.3 else None, "absolute_actions": rng.random() < 0.3}
+    mask = "train" if rng.random() < 0.3 else None
+    actions = "absolute" if rng.random() < 0.3 else "delta"
 
     def load() -> Outcome:
-        replay, expected = (LeRobotDemonstrations(place, **options) for place in (case, whole))
-        equal = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
-        if equal and replay.env_args == expected.env_args:
+        read, undamaged = (LeRobotDemonstrations(place, mask=mask) for place in (case, whole))
+        data, expected = (place.steps(actions=actions) for place in (read, undamaged))
+        equal = data.shape == expected.shape and bool((data == expected).all())
+        if equal and read.index().env_args == undamaged.index().env_args:
             return Outcome("equal")
         # Neither JSON nor parquet, as LeRobot writes it, keeps a checksum: another option of the environment,
         # or another number, is another recording's.
-        stored = equal if path.suffix == ".json" else _table_says_so(case, replay, options)
-        ok = stored and replay.task == expected.task
+        stored = equal if path.suffix == ".json" else _table_says_so(case, data, mask, actions)
+        ok = stored and read.index().task == undamaged.index().task
         return Outcome("as stored") if ok else Outcome("silent", "differs")
 
     return f"{path.relative_to(case)} {how}", load, str(case)
 
 
-def _table_says_so(folder: Path, replay: LeRobotDemonstrations, options: dict) -> bool:
+def _table_says_so(folder: Path, data: TensorDictBase, mask: str | None, actions: str) -> bool:
     """Whether pyarrow alone reads the same."""
     table = parquet.read_table(folder / "data/chunk-000/file-000.parquet")
-    rows = np.array(table["episode_index"]) == 0 if options["filter_key"] else np.s_[:]
+    rows = np.array(table["episode_index"]) == 0 if mask else np.s_[:]
 
     def columns(*names: str) -> torch.Tensor:
         values = [np.array(table[name].to_pylist()).reshape(len(table), -1) for name in names]
         return torch.from_numpy(np.concatenate(values, -1)[rows]).float()
 
     pairs = [
-        (replay.data["observation"], columns("observation.environment_state", "observation.state")),
-        (replay.data["next", "reward"], columns("next.reward")),
+        (data["observation"], columns("observation.environment_state", "observation.state")),
+        (data["next", "reward"], columns("next.reward")),
     ]
-    if not options["absolute_actions"]:
-        pairs.append((replay.data["action"], columns("action")))
+    if actions == "delta":
+        pairs.append((data["action"], columns("action")))
     return all(torch.equal(mine, theirs) for mine, theirs in pairs)
 
 

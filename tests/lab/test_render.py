@@ -20,8 +20,8 @@ from tests.errors import missing, raises
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
-from warmprior.data import DatasetError, RobomimicDemonstrations
-from warmprior.data.demonstrations import Demonstrations
+from warmprior.data import DatasetError
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.images import check_images
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
@@ -108,7 +108,7 @@ def test_the_layout_is_robomimics(recorded, rendered):
             for key in IMAGES:
                 assert demo["obs"][key].dtype == np.uint8
                 assert demo["obs"][key].chunks == (1, 16, 16, 3)
-        kwargs = render_module.read_index(rendered).env_args["env_kwargs"]
+        kwargs = RobomimicDemonstrations(rendered).index().env_args["env_kwargs"]
     assert (kwargs["camera_names"], kwargs["camera_heights"]) == (list(CAMERAS), 16)
 
 
@@ -196,13 +196,14 @@ def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
 def test_images_of_another_kind_are_refused(picture, value, facts):
     replaced(picture, value)
     with raises(DatasetError, "data/demo_1", *facts):
-        RobomimicDemonstrations(picture, image_keys=IMAGES)
+        RobomimicDemonstrations(picture).steps(images=IMAGES)
 
 
 @pytest.mark.slow
 def test_images_upside_down_are_refused(picture):
     key = f"data/demo_0/obs/{IMAGES[0]}"
-    compare = partial(apart(check_images), Demonstrations(picture), CAMERAS)
+    demonstrations = RobomimicDemonstrations(picture)
+    compare = partial(apart(check_images), demonstrations, demonstrations.index(images=IMAGES))
     compare(fast=True)
     with raises(DatasetError, "fast_rendering=True"):
         compare(fast=False)
@@ -231,13 +232,14 @@ def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkey
             attributes = file["data"].attrs
             attributes["env_args"] = attributes["env_args"].replace('"Lift"', f'"{lacking}"')
     with pytest.warns(UserWarning, match=f"{picture.name}.*{lacking}"):
-        check_images(Demonstrations(picture), CAMERAS, fast=True)
+        demonstrations = RobomimicDemonstrations(picture)
+        check_images(demonstrations, demonstrations.index(images=IMAGES), fast=True)
 
 
 def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("warmprior.envs.rendering.rendering_backend", lambda: None)
     small = "--encoder small --crop-size 12 --hidden-dim 8 --iterations 1 --batch-size 2 --held-out 0"
-    argv = f"train {picture} --fast-rendering --out {tmp_path / 'out'} {small} --image-keys".split()
+    argv = f"train {picture} --fast-rendering --out {tmp_path / 'out'} {small} --images".split()
     with pytest.warns(UserWarning, match=picture.name):
         assert main([*argv, *IMAGES]) == 0
     assert not missing(capsys.readouterr().out, "EGL", "only trained")
@@ -246,11 +248,9 @@ def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, mo
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
 def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
-    seen = {"observation_keys": ["robot0_eef_pos"], "image_keys": IMAGES}
     place = {"storage": storage, "scratch_dir": tmp_path if storage == "memmap" else None}
-    dataset = RobomimicDemonstrations(rendered, **seen, **place)
-    assert dataset.image_size == 16
-    buffer = window_replay_buffer(dataset.data, PastPrior(2), batch_size=32, observation_steps=2)
+    data = RobomimicDemonstrations(rendered).steps(["robot0_eef_pos"], IMAGES, **place)
+    buffer = window_replay_buffer(data, PastPrior(2), batch_size=32, observation_steps=2)
     stored = images_of(rendered)
     for row in buffer.sample():
         images = row["observation", IMAGES[0]]

@@ -169,7 +169,7 @@ def test_lerobots_own_loop_runs_a_policy_on_a_robot_of_a_package(tmp_path):
     assert np.abs(sent).max() <= 0.51  # targets of the demonstrations
     kept = ["--dataset.repo_id=local/rollout_arm", f"--dataset.root={tmp_path / 'rollout'}"]
     run("lerobot-rollout", *rollout, "--strategy.type=episodic", *kept, *recorded)
-    from warmprior.data import LeRobotDemonstrations
+    from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
-    steps = LeRobotDemonstrations(tmp_path / "rollout", observation_keys=["observation.state"]).data
+    steps = LeRobotDemonstrations(tmp_path / "rollout").steps(observations=["observation.state"])
     assert len(steps["episode"].unique()) == 2 and steps["action"].abs().max() <= 0.51

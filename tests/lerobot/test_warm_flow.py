@@ -15,7 +15,7 @@ from warmprior import (
     VelocityMLP,
     keys,
 )
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.training import precondition
 
@@ -57,7 +57,7 @@ def dataset_policy(found, root, episodes=None, place=None, streamed=False, **opt
 
 def moments_by_hand(policy, dataset, episodes):
     """Return the moments of some episodes, normalised by all, as LeRobot's processors do: -1 if constant."""
-    steps = LeRobotDemonstrations(dataset.root, observation_keys=policy.config.observed).data
+    steps = LeRobotDemonstrations(dataset.root).steps(observations=policy.config.observed)
     steps = steps[torch.isin(steps["episode"], torch.tensor(episodes))].clone()
     low, high = (torch.as_tensor(dataset.meta.stats["action"][end]).float() for end in ("min", "max"))
     steps["action"] = 2 * (steps["action"] - low) / (high - low).clamp_min(1e-8) - 1
@@ -357,7 +357,7 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     """The trend is that of this library for the same steps; with it a policy is saved and loaded."""
     values = joint_dataset(tmp_path / "data")
     policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, prior="past")
-    assert policy.config.joint_key == "observation.state"
+    assert policy.config.joints == "observation.state"
     low, high = (torch.as_tensor(values["action"]).float().aminmax(dim=0)[i] for i in (0, 1))
     scaled = 2 * (torch.as_tensor(values["action"]).float() - low) / (high - low) - 1
     steps = {"observation": scaled, "action": scaled, "episode": torch.arange(36) // 12}
@@ -369,7 +369,7 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     stirred(policy.actor.network).train()
     policy.save_pretrained(tmp_path / "policy")
     again = found["warm_flow"].from_pretrained(tmp_path / "policy")
-    assert again.config.joint_key == "observation.state"
+    assert again.config.joints == "observation.state"
     batch = {"observation.state": torch.randn(2, 3)}
     chunks = []
     for one in (policy, again):
@@ -383,15 +383,15 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
 def test_other_actions_are_no_joint_targets(found, tmp_path, names, near):
     joint_dataset(tmp_path / "data", names, near)
     policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4)
-    assert policy.config.joint_key == "" and policy.actor.network.trend is None
-    asked = {"joint_key": "observation.state"}
+    assert policy.config.joints == "" and policy.actor.network.trend is None
+    asked = {"joints": "observation.state"}
     if near:  # the names are only how they are recognised
         policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, **asked)
         assert policy.actor.network.trend is not None
         return
-    with raises(ValueError, "observation.state", "joint_key="):
+    with raises(ValueError, "observation.state", "joints="):
         dataset_policy(found, tmp_path / "data", **asked)
-    with raises(ValueError, "joint_key", "observation.state", "'wrist'"):
-        dataset_policy(found, tmp_path / "data", joint_key="wrist")
+    with raises(ValueError, "joints", "observation.state", "'wrist'"):
+        dataset_policy(found, tmp_path / "data", joints="wrist")
     with raises(ValueError, "precondition=true"):
         dataset_policy(found, tmp_path / "data", precondition=False, **asked)

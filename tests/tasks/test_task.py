@@ -16,10 +16,10 @@ from tests.errors import raises
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, PoseTrend, RestingJoints, keys
+from warmprior.data import demonstrations_of, open_demonstrations
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
-from warmprior.tasks import Task
-from warmprior.tasks.recorded import opened
+from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.train import new_policy
 from warmprior.transforms import AbsoluteActions
@@ -36,9 +36,13 @@ def steps(n=40, **changed):
     return TensorDict({k: v for k, v in (data | changed).items() if v is not None}, [n])
 
 
+def own(data, make_env=None, name="own", joints=None, **played):
+    return Task(demonstrations_of(data, name), joints=joints, play=Play(make_env, **played))
+
+
 def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     raw = steps()
-    task = Task.of("own", raw, CountingEnv, measures={"reward": "sum"})
+    task = own(raw, CountingEnv, measures={"reward": "sum"})
     for key in ("observation", "action"):  # every dimension spans [-1, 1]
         low, high = raw[key].amin(0), raw[key].amax(0)
         expected = 2 * (raw[key] - low) / (high - low) - 1
@@ -49,13 +53,13 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     assert (title_of(task), longest_of(task), task.images) == ("own human", 10, {})
     assert raw["action"].max() > 50  # the data themselves stay as they were
     # What policies are trained on is what identifies it.
-    again, other = (Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2))
+    again, other = (own(steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2))
     assert task.identity == again.identity != other.identity
     # In other units they are equal once normalised, and yet others.
-    scaled = Task.of("own", steps(action=2 * raw["action"]), CountingEnv)
+    scaled = own(steps(action=2 * raw["action"]), CountingEnv)
     torch.testing.assert_close(scaled.data["action"], task.data["action"])
     assert scaled.identity != task.identity
-    single = [Task.of("own", steps(1, episode=torch.tensor([0]).as_strided([1], [n]))) for n in (0, 1)]
+    single = [own(steps(1, episode=torch.tensor([0]).as_strided([1], [n]))) for n in (0, 1)]
     assert single[0].identity == single[1].identity  # TorchRL's buffers of one step may be expanded numbers
 
 
@@ -64,7 +68,7 @@ def test_no_action_leaves_the_range_of_the_demonstrations(precondition):
     """One dimension never moves, and one is so far from zero that it counts as constant."""
     moving = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
     raw = steps(action=torch.cat((moving, torch.full((40, 1), 0.7), 400_000 + 6 * moving), 1))
-    task = Task.of("arm", raw, CountingEnv)
+    task = own(raw, CountingEnv)
     network = NetworkOptions(hidden_dim=8, precondition=precondition)
     policy = new_policy(task, GaussianPrior(4), network, TrainingConfig(iterations=1))
     observation = torch.randn(64, 2, 3, generator=torch.Generator().manual_seed(1))
@@ -83,7 +87,7 @@ def test_no_action_leaves_the_range_of_the_demonstrations(precondition):
 
 def test_a_function_of_ones_own_is_found_by_its_place(monkeypatch):
     place = ModuleType("a_users_module")
-    place.task = lambda options: Task.of("own", steps()[: options.count("ph")], CountingEnv)
+    place.task = lambda options: own(steps()[: options.count("ph")], CountingEnv)
     place.number = lambda options: 3
     monkeypatch.setitem(sys.modules, "a_users_module", place)
     options = DataOptions(demonstrations=(20,))
@@ -107,7 +111,7 @@ def path(tmp_path_factory):
 
 
 def in_both_spaces(path):
-    return [Task.open(path, actions=a) for a in ("delta", "absolute")]
+    return [Task(open_demonstrations(path), actions=a) for a in ("delta", "absolute")]
 
 
 def test_absolute_actions_have_the_units_of_deltas(path):
@@ -136,14 +140,14 @@ def joint_steps(n=400):
     return seen, torch.cat([joints + moves, command], -1), moves
 
 
-def arm(seen, action):
-    return Task.of("arm", steps(len(action), observation=seen, action=action))
+def arm(seen, action, joints=None):
+    return own(steps(len(action), observation=seen, action=action), joints=joints)
 
 
 def test_joint_targets_are_learnt_from_where_the_joints_are():
     seen, action, moves = joint_steps()
     plain = arm(seen, action)
-    task = plain.with_joints([2, 1, -1])
+    task = arm(seen, action, [2, 1, -1])
     assert task.identity != plain.identity == arm(seen, action).identity
     rest = task.normalizer.denormalize(TensorDict({"action": task.rest(task.data["observation"])}, [400]))
     torch.testing.assert_close(rest["action"][:, :2], seen[:, [2, 1]], rtol=1e-4, atol=1e-4)
@@ -167,21 +171,21 @@ def test_joints_may_hang_below_their_targets():
         *(([2, 1], 3), ([2, 3, -1], "-1 to 2"), ([-1, -1, -1], -1), ([2, 1.5, -1], 1)),
     ):
         with raises(ValueError, *facts):
-            arm(seen, action).with_joints(columns)
+            arm(seen, action, columns)
     action[:, :2] = seen[:, [2, 1]] + torch.tensor([0.5, 10.0])
     seen = torch.cat([seen, torch.rand(400, 1)], -1)
     action = torch.cat([action, torch.full((400, 1), 0.3)], -1)
-    task = arm(seen, action).with_joints([2, 1, -1, 3])
+    task = arm(seen, action, [2, 1, -1, 3])
     assert isinstance(task.rest, RestingJoints)
     for factor in (0.5, 57.3):  # other units
         other = action * torch.tensor([factor, factor, 1.0, 1.0])
         with raises(ValueError, "units"):
-            arm(seen, other).with_joints([2, 1, -1, -1])
+            arm(seen, other, [2, 1, -1, -1])
 
 
 def test_other_observations_are_another_task(path):
     keys = ["object", "robot0_eef_pos"]
-    tasks = [Task.open(path, observation_keys=k) for k in (None, keys, keys[::-1])]
+    tasks = [Task(open_demonstrations(path), observations=k) for k in (None, keys, keys[::-1])]
     assert len({task.identity for task in tasks}) == 3
 
 
@@ -189,7 +193,7 @@ def test_joint_targets_beside_images():
     seen, action, _ = joint_steps(60)
     images = torch.zeros(60, 3, 16, 16, dtype=torch.uint8)
     observation = TensorDict({"state": seen, "front": images}, [60])
-    task = arm(observation, action).with_joints([2, 1, -1])
+    task = arm(observation, action, [2, 1, -1])
     options = NetworkOptions(hidden_dim=16, observation_steps=1, encoder="small", crop_size=12)
     network = new_policy(task, GaussianPrior(1), options, TrainingConfig()).network
     data = task.data[:5]["observation"].unsqueeze(1)
@@ -209,22 +213,21 @@ def test_data_that_cannot_be_are_named():
         ("../own", {}, ValueError, "'../own'"),
     ):
         with raises(error, *facts):
-            Task.of(name, steps(**changed), CountingEnv)
+            own(steps(**changed), CountingEnv, name=name)
     for shapes in ({"front": (3, 32, 48)}, {"front": (3, 32, 32), "wrist": (3, 16, 16)}):
         images = {name: torch.zeros(40, *shape, dtype=torch.uint8) for name, shape in shapes.items()}
         with raises(ValueError, "own", f"'{[*shapes][-1]}'", "size"):
-            Task.of("own", steps(observation=TensorDict(images | {"state": torch.rand(40, 2)}, [40])))
+            own(steps(observation=TensorDict(images | {"state": torch.rand(40, 2)}, [40])))
     fitting = {"observation": torch.randn(40, 9), "action": torch.rand(40, 1)}
-    Task.of("own", steps(**fitting), NavigationEnv).check_environment()
+    own(steps(**fitting), NavigationEnv).check_environment()
     for changed in ({"observation": torch.randn(40, 5)}, {"action": torch.rand(40, 3)}):
-        task = Task.of("own", steps(**fitting | changed), NavigationEnv)
+        task = own(steps(**fitting | changed), NavigationEnv)
         with raises(ValueError, "own human", f"'{next(iter(changed))}'"):
             task.check_environment()
 
 
 def test_an_environment_with_transforms_of_its_own_takes_random_chunks():
-    task = Task.of(
-        "own",
+    task = own(
         steps(observation=torch.randn(40, 9), action=torch.rand(40, 1)),
         lambda: TransformedEnv(NavigationEnv(), StepCounter()),
     )
@@ -241,7 +244,7 @@ def test_an_environment_with_images_fits_its_demonstrations():
     def pictured(size, action_dim):
         seen = {"state": torch.rand(40, 4), "cam": torch.zeros(40, 3, size, size, dtype=torch.uint8)}
         changed = {"observation": TensorDict(seen, [40]), "action": torch.rand(40, action_dim)}
-        return Task.of("own", steps(**changed), partial(CameraEnv, 7))
+        return own(steps(**changed), partial(CameraEnv, 7))
 
     pictured(10, 2).check_environment()
     # One action would be given to both dimensions of the environment's.
@@ -255,32 +258,33 @@ def test_an_environment_with_images_fits_its_demonstrations():
     [
         ({"actions": "absolute", "horizon": 9}, "actions, horizon"),
         ({"fast_rendering": True, "make_env": NavigationEnv}, "fast_rendering"),
-        ({"fast_rendering": True}, "image_keys"),
+        ({"fast_rendering": True}, "images"),
         ({"success": "solved"}, "make_env"),
         ({"actions": "pose"}, "delta, absolute"),
     ],
 )
 def test_an_option_that_cannot_be_applied_is_refused(path, tmp_path, options, named):
-    place = path
+    place, actions = path, options.pop("actions", "delta")
+    images = {"images": ["agentview_image"]} if "make_env" in options else {}
     if "horizon" in options:  # a robot's file
         place = shutil.copy(path, tmp_path / "robot.hdf5")
         with pytest.importorskip("h5py").File(place, "a") as file:
             del file["data"].attrs["env_args"]
     with raises(ValueError, named):
-        Task.open(place, **options)
+        Task(open_demonstrations(place), **images, actions=actions, play=Play(**options))
 
 
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 
-    whole, part, all_ = (Task.open(path, demos=n) for n in (None, 1, 2))
+    whole, part, all_ = (Task(open_demonstrations(path, demos=n)) for n in (None, 1, 2))
     assert all_.identity == whole.identity != part.identity  # other policies, of the same file
     assert part.facts["sha256"] == whole.facts["sha256"]
     assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
     mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
     assert torch.allclose(mine, theirs[:30], atol=1e-6)
     with raises(DatasetError, 2, "demos=3"):
-        Task.open(path, demos=3)
+        Task(open_demonstrations(path, demos=3))
 
 
 def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
@@ -300,12 +304,12 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     from warmprior.data import convert_robomimic
 
     folder = convert_robomimic(path, tmp_path / "lift")
-    file, theirs = (Task.open(p, task="lift") for p in (path, f"lerobot:{folder}"))
+    file, theirs = (Task(open_demonstrations(p, task="lift")) for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity
     (folder / "meta" / "warmprior.json").unlink()  # as from another converter
     for actions, width in (("delta", 7), ("absolute", 10)):
-        named = Task.open(f"lerobot:{folder}", task="lift", actions=actions)
+        named = Task(open_demonstrations(f"lerobot:{folder}", task="lift"), actions=actions)
         assert named.data["action"].shape[-1] == width
         assert named.environment["robosuite"]["env_args"]["env_name"] == "Lift"
-    assert opened(f"lerobot:{folder}", "lift").name == "lerobot:lift"
+    assert open_demonstrations(f"lerobot:{folder}", task="lift").name == "lerobot:lift"

@@ -12,6 +12,7 @@ from tests.states import copied, same
 from tests.together import together
 from tests.toy_env import demonstrations, random_history
 from warmprior import CVAEPrior, GaussianPrior, PastPrior, PreviewPrior, Prior, StartPoint
+from warmprior.data import demonstrations_of
 from warmprior.deploy import AsyncExecutor
 from warmprior.saving import load_policy
 from warmprior.saving.checkpoint import load_state, save_state
@@ -78,7 +79,7 @@ def test_a_prior_of_ones_own_learns_from_the_windows_of_the_flow(tmp_path):
     policy = policy_of(tmp_path, given, data)
     ((windows, held_out, iterations),) = fits
     assert iterations == 2  # a quarter
-    data = Task.of("steps", data).data  # normalised
+    data = Task(demonstrations_of(data, "steps")).data  # normalised
     number = data["episode"]
     assert held_out["frame"].tolist() == list(range(10))
     expected = []

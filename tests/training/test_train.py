@@ -12,7 +12,7 @@ from tests.errors import raises
 from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
-from warmprior.data import RobomimicDemonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.deploy import AsyncExecutor
 from warmprior.evaluation import evaluate
 from warmprior.modules import PreconditionedNetwork
@@ -110,7 +110,7 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
     make_training(tmp_path, environment_steps=90, collection={"description": "agent"}).run()
     evaluate(make_actor(), make_env(0), episodes=2, first_seed=0, description="play")
     write_robomimic_file(tmp_path / "images.hdf5", lengths=(30,))
-    RobomimicDemonstrations(tmp_path / "images.hdf5", image_keys=("agentview_image",))
+    RobomimicDemonstrations(tmp_path / "images.hdf5").steps(images=("agentview_image",))
     said = capsys.readouterr().err
     shown = [f"{name}:" in said for name in ("train", "agent", "play", "read images.hdf5")]
     assert shown == [not turned_off] * 4

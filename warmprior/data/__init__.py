@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.formats.hdf5 import RobomimicDemonstrations
-from warmprior.data.formats.lerobot import LeRobotDemonstrations
-from warmprior.data.formats.minari import MinariDemonstrations
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.index import DatasetError
+from warmprior.data.memory import demonstrations_of
 from warmprior.data.observe import observe_recordings
-from warmprior.data.replay import DatasetError
+from warmprior.data.opening import open_demonstrations
 
 __all__ = [
     "DatasetError",
-    "LeRobotDemonstrations",
-    "MinariDemonstrations",
-    "RobomimicDemonstrations",
+    "Demonstrations",
     "convert_robomimic",
+    "demonstrations_of",
     "observe_recordings",
+    "open_demonstrations",
 ]

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from warmprior.checks import check_choice
-from warmprior.data.formats.hdf5 import RobomimicDemonstrations, read_index, read_masks, read_origin
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.formats.lerobot_index import (
     DESCRIPTION,
     REWARD,
@@ -26,7 +26,8 @@ from warmprior.data.formats.lerobot_index import (
     layout_of,
     state_names,
 )
-from warmprior.data.replay import DatasetError, DatasetIndex, declared_poses, solved
+from warmprior.data.index import DatasetError, DatasetIndex, declared_poses
+from warmprior.data.steps import solved
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE
@@ -41,7 +42,7 @@ def convert_robomimic(
     *,
     images: Literal["image", "video"] | None = None,
     demos: int | None = None,
-    observation_keys: Sequence[str] | None = None,
+    observations: Sequence[str] | None = None,
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
@@ -57,7 +58,7 @@ def convert_robomimic(
         images: format of the file's images, if they are written too: pictures (``"image"``, lossless PNG) or
             videos (``"video"``, lossy, smaller).
         demos: number of demos to convert, the first ones by their numbers; all if ``None``.
-        observation_keys: observations to write; by default the task's. If they differ from these, name them
+        observations: observations to write; by default the task's. If they differ from these, name them
             again when opening the dataset.
 
     Raises:
@@ -77,8 +78,8 @@ def convert_robomimic(
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     path, folder = Path(path), Path(folder).expanduser()
-    chosen: dict[str, Any] = {"demos": demos, "observation_keys": observation_keys}
-    index = read_index(path, **chosen)
+    demonstrations = RobomimicDemonstrations(path, demos=demos)
+    index = demonstrations.index(observations)
     if not index.env_args:
         raise DatasetError(
             f"{path} has no data.attrs['env_args'], which say how fast it was recorded (control_freq): write "
@@ -89,7 +90,7 @@ def convert_robomimic(
         keys = [f"{camera}_image" for camera in index.cameras]
         if not keys:
             raise DatasetError(f"{path} has no images: render them first, or use images=None")
-        index = read_index(path, image_keys=keys, **chosen)
+        index = demonstrations.index(observations, keys)
         side = index.image_size
         if images == "video" and side < VIDEO_SIZE:
             raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; use images='image'")
@@ -106,7 +107,7 @@ def convert_robomimic(
         try:
             # The files that a killed process left are incomplete.
             shutil.rmtree(whole, ignore_errors=True)
-            _write(datasets, index, whole, int(fps), images)
+            _write(datasets, demonstrations, index, whole, int(fps), images)
             os.rename(whole, folder)
         finally:
             shutil.rmtree(parts, ignore_errors=True)
@@ -139,18 +140,16 @@ def _camera(key: str) -> str:
 
 
 def _write(
-    datasets: Any, index: DatasetIndex, root: Path, fps: int, images: Literal["image", "video"] | None
+    datasets: Any,
+    demonstrations: RobomimicDemonstrations,
+    index: DatasetIndex,
+    root: Path,
+    fps: int,
+    images: Literal["image", "video"] | None,
 ) -> None:
     layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
-    task = index.env_args["env_name"].lower() if index.task is None else index.task.name
-    data = RobomimicDemonstrations(
-        index.path,
-        demos=len(index.demos),
-        observation_keys=index.observation_keys,
-        image_keys=index.image_keys,
-        storage="memmap" if images else "memory",
-        as_recorded=True,
-    ).data
+    storage: Any = "memmap" if images else "memory"
+    data = demonstrations.steps(index.observation_keys, index.image_keys, actions="stored", storage=storage)
     outcome = _outcome(data, index)
     dataset = datasets.LeRobotDataset.create(
         f"local/{root.name}",
@@ -173,7 +172,7 @@ def _write(
                     frame = {name: value[row].numpy() for name, value in numbers.items()}
                     for key in index.image_keys:
                         frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
-                    dataset.add_frame(frame | {"task": task})
+                    dataset.add_frame(frame | {"task": index.task_name})
                 # Parallel encoding would start a process, which imports LeRobot, per camera and episode.
                 dataset.save_episode(parallel_encoding=False)
         except BaseException:
@@ -182,7 +181,7 @@ def _write(
                 dataset.finalize()
             raise
         dataset.finalize()
-    described = json.dumps(_description(index, layout), indent=1)
+    described = json.dumps(_description(demonstrations, index, layout), indent=1)
     write_atomic(root / DESCRIPTION, lambda file: file.write_text(described))
 
 
@@ -195,16 +194,18 @@ def _outcome(data: TensorDictBase, index: DatasetIndex) -> dict[str, torch.Tenso
     return features | ({SUCCESS: success} if success.any() else {})
 
 
-def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+def _description(
+    demonstrations: RobomimicDemonstrations, index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]
+) -> dict[str, Any]:
     """Return the facts for which LeRobot's own files have no place."""
     observations: dict[str, tuple[str, int, int]] = {}
     for feature, widths in layout.items():
         borders = pairwise(np.cumsum([0, *widths.values()]).tolist())
         observations |= {key: (feature, *border) for key, border in zip(widths, borders, strict=True)}
-    rendering, state = read_origin(index.path, index.demos[0])
+    rendering, state = demonstrations.origin(index)
     masks = {
         name: [index.demos.index(demo) for demo in demos if demo in index.demos]
-        for name, demos in read_masks(index.path).items()
+        for name, demos in demonstrations.masks().items()
     }
     return {
         "format": 1,

@@ -1,94 +1,190 @@
-"""Places of demonstrations: robomimic HDF5 files, and LeRobot and Minari datasets."""
+"""What a place holds: demonstrations in any format, raw as recorded."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
-from warmprior.data.formats.hdf5 import RobomimicDemonstrations, read_index
-from warmprior.data.formats.lerobot import LeRobotDemonstrations
-from warmprior.data.formats.lerobot_index import camera_images, read_lerobot_index
-from warmprior.data.formats.minari import MinariDemonstrations, minari_environment, read_minari_index
-from warmprior.data.replay import DatasetIndex, DemonstrationReplay
-from warmprior.io.files import digest_of, file_digest
+import numpy as np
+from tensordict import TensorDictBase
 
-LEROBOT, MINARI = "lerobot:", "minari:"
-"""The prefixes of a LeRobotDataset's folder or repository, and of a Minari dataset's name."""
-
-
-def dataset_name(place: str | Path, prefix: str) -> str | None:
-    """Return the part of a place after a prefix, :data:`LEROBOT` or :data:`MINARI`, if it begins with it."""
-    text = str(place)
-    return text.removeprefix(prefix) if text.startswith(prefix) else None
-
-
-def name_of_place(place: str | Path) -> str:
-    """Return the short name of a file, without its ending, or of a folder, repository or dataset."""
-    if (name := dataset_name(place, MINARI)) is not None:
-        return name.replace("/", "-")
-    folder = dataset_name(place, LEROBOT)
-    return Path(place).stem if folder is None else Path(folder).resolve().name
+from warmprior.data.index import DatasetIndex, DemonstrationReader
+from warmprior.data.steps import Storage, StoredActions, read_steps
+from warmprior.io.files import digest_of
 
 
 class Demonstrations:
-    """The demonstrations at one place; their values are only read by :meth:`replay`.
+    """The demonstrations at one place, raw as recorded: the base class of formats.
 
-    A place is an HDF5 file, ``lerobot:`` and the folder or repository of a LeRobotDataset, or ``minari:`` and
-    the name of a Minari dataset.
+    :func:`open_demonstrations` makes one. Nothing is read before it is asked for.
 
-    ``env_args`` are for a LeRobotDataset that does not describe its own environment; a ``mask``, such as
-    ``"train"``, selects some demonstrations. ``name`` is the name of the place in results.
+    Args:
+        place: the place, without the prefix of its format.
+
+    Keyword Args:
+        demos: number of demonstrations to take, from the first on; all by default.
+        mask: a mask of the place, such as ``"train"``, which selects some demonstrations.
+        style: style of the recording, such as ``"ph"`` or ``"human"``, which decides robosuite's time limit.
+        task: the task of robosuite, or its ``env_args``, for a place that does not describe its environment.
 
     Examples:
-        >>> from warmprior.data.demonstrations import Demonstrations
-        >>> Demonstrations("lerobot:user/square").name  # nothing is fetched yet
-        'lerobot:square'
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior.data import demonstrations_of
+        >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
+        ...          "episode": torch.arange(60) // 20}
+        >>> demonstrations_of(TensorDict(steps, [60]), "pendulum")
+        pendulum: 3 demonstrations, 60 steps; actions [1]; observations observation [3]
     """
 
+    prefix: ClassVar[str]
+    """What a place in this format begins with."""
+
+    normalised: ClassVar[bool] = False
+    """True if the numbers are in normalised units."""
+
     def __init__(
-        self, place: str | Path, env_args: Mapping[str, Any] | None = None, mask: str | None = None
+        self,
+        place: str | Path,
+        *,
+        demos: int | None = None,
+        mask: str | None = None,
+        style: str | None = None,
+        task: str | Mapping[str, Any] | None = None,
     ) -> None:
-        self._mask = mask
-        self._options: dict[str, Any] = {"filter_key": mask}
-        kinds: dict[str, tuple[Any, Any]] = {
-            LEROBOT: (read_lerobot_index, LeRobotDemonstrations),
-            MINARI: (read_minari_index, MinariDemonstrations),
-            "": (read_index, RobomimicDemonstrations),
-        }
-        self._prefix = next(prefix for prefix in kinds if str(place).startswith(prefix))
-        self._place: Any = str(place).removeprefix(self._prefix)
-        self._index, self._replay = kinds[self._prefix]
-        if self._prefix == LEROBOT:
-            self._options["env_args"] = env_args
-        name = f"{self._prefix}{name_of_place(place)}" if self._prefix else Path(place).name
-        self.name = name if mask is None else f"{name} (mask {mask})"
+        self.place, self.demos, self.mask, self.style, self.task = place, demos, mask, style, task
 
-    def image_keys(self, names: Sequence[str]) -> list[str]:
-        """Return policies' names of images; LeRobot's own, ``observation.images.front``, are converted."""
-        images = camera_images(name for name in names if name.startswith("observation."))
-        converted = {name: key for key, name in images.items()}
-        return [converted.get(name, name) for name in names]
+    @property
+    def title(self) -> str:
+        """The short name of the place, such as ``"square"``."""
+        return Path(self.place).resolve().name
 
-    def index(self, **options: Any) -> DatasetIndex:
-        """Return the index, with options of ``read_index`` (``image_keys``, ``demos`` and so on)."""
-        return self._index(self._place, **self._options, **options)
+    @property
+    def name(self) -> str:
+        """The name of the place in results, such as ``"square.hdf5"``."""
+        name = f"{self.prefix}{self.title}" if self.prefix else Path(self.place).name
+        return name if self.mask is None else f"{name} (mask {self.mask})"
 
-    def replay(self, **options: Any) -> DemonstrationReplay:
-        """Read the demonstrations, with options of :class:`RobomimicDemonstrations`."""
-        return self._replay(self._place, **self._options, **options)
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Facts about the place for results, as JSON."""
+        return {"source": "file", "file": self.name}
 
-    def environment(self) -> dict[str, Any] | None:
-        """Return the recorded Gymnasium environment, for :func:`warmprior.envs.registered_env`, if any."""
-        return minari_environment(self._place) if self._prefix == MINARI else None
+    def __str__(self) -> str:
+        return f"{self.prefix}{self.place}"
 
-    def digest(self, **used: Any) -> str:
-        """Return the SHA-256 of the contents; in a LeRobotDataset, of those that the options select."""
-        if self._prefix == LEROBOT:
-            whole = read_lerobot_index(self._place, fetch=True, **self._options, **used).digest()
-        elif self._prefix == MINARI:
-            files = sorted(path for path in self.index().path.rglob("*") if path.is_file())
-            whole = digest_of(*map(file_digest, files))
-        else:
-            whole = file_digest(self._place)
-        return whole if self._mask is None else digest_of(whole, self._mask)
+    def __repr__(self) -> str:
+        try:
+            index = self.index()
+        except (OSError, ValueError, ImportError) as error:
+            return f"{self}: {error}"
+        seen = zip(index.observation_keys, index.observation_dims, strict=True)
+        parts = [
+            f"{len(index.demos)} demonstrations, {sum(index.lengths)} steps",
+            f"actions [{index.action_dim}]",
+            f"observations {', '.join(f'{key} [{width}]' for key, width in seen)}",
+        ]
+        if others := [key for key in index.available_keys if key not in index.observation_keys]:
+            parts.append(f"others {', '.join(others)}")
+        if index.rate is not None:
+            parts.append(f"{index.rate:g} steps per second")
+        for kind, described in self.environment(index).items():
+            parts.append(f"recorded in {kind}'s {described.get('env_name', described.get('id'))}")
+        return f"{self}: {'; '.join(parts)}"
+
+    def only(self, demos: int) -> Self:
+        """Return the first of these demonstrations."""
+        fewer = copy.copy(self)
+        fewer.demos = demos
+        return fewer
+
+    def check(self) -> None:
+        """Check that the place may hold demonstrations; nothing is read or downloaded.
+
+        Raises FileNotFoundError if there is no such file or folder, and ImportError if the package that reads
+        it is not installed.
+        """
+        raise NotImplementedError
+
+    def resolved(self) -> str:
+        """Return the place with an absolute path, so that it holds in any working directory."""
+        return str(self)
+
+    def index(
+        self,
+        observations: Sequence[str] | None = None,
+        images: Sequence[str] = (),
+        *,
+        poses: bool = False,
+    ) -> DatasetIndex:
+        """Return the index, from names and shapes alone; with ``poses`` every arm's pose must be there."""
+        raise NotImplementedError
+
+    def reader(self, index: DatasetIndex) -> AbstractContextManager[DemonstrationReader]:
+        """Return a reader of the values, which is open until the context ends."""
+        raise NotImplementedError
+
+    def contents(self, index: DatasetIndex) -> str:
+        """Return the SHA-256 of what the place holds for an index."""
+        raise NotImplementedError
+
+    def environment(self, index: DatasetIndex) -> dict[str, Any]:
+        """Return the recorded environment by its kind, ``"robosuite"`` or ``"gymnasium"``; {} if unknown."""
+        return {"robosuite": index.env_args} if index.env_args else {}
+
+    def origin(self, index: DatasetIndex) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+        """Return the rendering options of the images, and the first simulator state, if they are known."""
+        return None, None
+
+    def digest(self, index: DatasetIndex) -> str:
+        """Return the SHA-256 of the contents, and of the mask."""
+        whole = self.contents(index)
+        return whole if self.mask is None else digest_of(whole, self.mask)
+
+    def steps(
+        self,
+        observations: Sequence[str] | None = None,
+        images: Sequence[str] = (),
+        *,
+        actions: StoredActions = "delta",
+        storage: Storage = "memory",
+        scratch_dir: str | Path | None = None,
+    ) -> TensorDictBase:
+        """Read the demonstrations as one flat, contiguous TensorDict of ``N`` steps.
+
+        - ``"observation"`` ``[N, d_o]`` float32, the concatenated observations; with images it is nested:
+          ``("observation", "state")`` ``[N, d_s]``, and each image uint8 ``[N, 3, size, size]``;
+        - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
+        - ``("next", "reward")`` ``[N, 1]`` float32, zeros if none is recorded;
+        - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
+          on the last step of each demo; terminated there as recorded, or if its reward is that of a solved
+          task (robosuite's ``reward_scale``, 1 by default), else truncated;
+        - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row number.
+
+        Names, shapes and masks are checked before values are read.
+
+        Args:
+            observations: observations to concatenate; by default those of the task, or those that the format
+                chooses (:doc:`/data`).
+            images: images to read as well, such as ``"agentview_image"``; they stay bytes.
+
+        Keyword Args:
+            actions: pose deltas as recorded; or ``"absolute"``, the poses that they target, of 10 numbers per
+                arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
+                also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
+            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk.
+            scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
+
+        Raises:
+            FileNotFoundError: if there is no such place.
+            DatasetError: if it is invalid; the message names the file, demo and key.
+            ValueError: if ``storage`` is unknown, or actions of a controller without pose deltas are to be
+                absolute.
+            OSError: if a download fails, or there is no space for memory maps.
+        """
+        index = self.index(observations, images, poses=actions == "absolute")
+        with self.reader(index) as reader:
+            return read_steps(index, reader, actions=actions, storage=storage, scratch_dir=scratch_dir)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from importlib.metadata import version
 
 import numpy as np
 
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.hdf5 import read_origin
-from warmprior.data.formats.lerobot_index import LeRobotIndex
-from warmprior.data.replay import DatasetError, DatasetIndex, store_finite
+from warmprior.data.index import DatasetError, DatasetIndex, store_finite
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer
 from warmprior.envs.simulator import make_simulator, scene_stays
@@ -56,10 +54,10 @@ class StateRenderer:
         store_finite(states, states, what, "Leave the demo out.")  # MuJoCo would render NaN without an error
         return states[:, 1 : 1 + model.nq]
 
-    def compare(self, state: Sequence[float], images: Mapping[str, np.ndarray], advice: str) -> None:
+    def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
         name = self.index.path
-        (joints,) = self.joints(np.array([state], np.float64), 1, f"{name}: the first state")
+        (joints,) = self.joints(state[None], 1, f"{name}: the first state")
         for camera, image in images.items():
             shown = self.renderer.render(camera, joints).astype(np.float32)
             stored = image.astype(np.float32)
@@ -79,25 +77,20 @@ class StateRenderer:
                 )
 
 
-def check_images(demonstrations: Demonstrations, cameras: Sequence[str], fast: bool) -> None:
-    """Compare the first images of some cameras with the simulator's.
+def check_images(demonstrations: Demonstrations, index: DatasetIndex, fast: bool) -> None:
+    """Compare the first images of an index with the simulator's.
 
     Raises DatasetError if they differ, or were rendered in the other quality; warns if there is no state, or
     this machine cannot render, or lacks the simulator.
     """
-    keys = [f"{camera}_image" for camera in cameras]
-    index = demonstrations.index(image_keys=keys, demos=1)
-    if isinstance(index, LeRobotIndex):
-        rendering, state = (index.described.get(name) for name in ("rendering", "first_state"))
-    else:
-        rendering, state = read_origin(index.path, index.demos[0])
+    rendering, state = demonstrations.origin(index)
     if rendering is not None and bool(rendering["fast"]) != fast:
         how = "in full quality" if fast else "fast"
         raise DatasetError(f"{index.path}: its images were rendered {how}: use fast_rendering={not fast}")
     why = "it holds no states"
     if state is not None:
-        first = demonstrations.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
-        images = {camera: first[f"{camera}_image"].permute(1, 2, 0).numpy() for camera in cameras}
+        first = demonstrations.only(1).steps(index.observation_keys, index.image_keys)[OBSERVATION][0]
+        images = {key.removesuffix("_image"): first[key].permute(1, 2, 0).numpy() for key in index.image_keys}
         try:
             StateRenderer(index, index.image_size, fast).compare(state, images, "render these again")
             return

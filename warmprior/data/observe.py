@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from warmprior.data.formats.hdf5 import member, open_robomimic, read_described, reading, selected_demos
-from warmprior.data.replay import DatasetError, check_count, check_env_args, store_finite
+from warmprior.data.index import DatasetError, check_count, check_env_args, store_finite
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.simulator import make_simulator, scene_stays
@@ -26,7 +26,7 @@ def observe_recordings(
     path: str | Path,
     out: str | Path,
     *,
-    observation_keys: Sequence[str] | None = None,
+    observations: Sequence[str] | None = None,
     demos: int | None = None,
 ) -> Path:
     """Replay the states of recordings, and write the simulator's observations together with the actions.
@@ -41,7 +41,7 @@ def observe_recordings(
         out: the file to write; it must not exist.
 
     Keyword Args:
-        observation_keys: robosuite's observations to write; by default the object and every arm's pose,
+        observations: robosuite's observations to write; by default the object and every arm's pose,
             gripper and joints.
         demos: number of demos, from the first on; all by default.
 
@@ -74,7 +74,7 @@ def observe_recordings(
             *low_dim_keys(len(env.robots)),
             *(f"robot{i}_{k}" for i in range(len(env.robots)) for k in _MORE),
         ]
-        loop = StepLoop(env, usual if observation_keys is None else observation_keys)
+        loop = StepLoop(env, usual if observations is None else observations)
         check_writable(out.parent)
 
         def write(temporary: Path) -> None:

@@ -232,8 +232,8 @@ def evaluate(
     """
     if isinstance(env, Task):
         if success != keys.SUCCESS or measures is not None:
-            raise ValueError("a Task has its own success and measures: give them to the Task instead")
-        success, measures = env.success, env.measures
+            raise ValueError("a Task has its own success and measures: give them to its Play instead")
+        success, measures = env.play.success, env.play.measures
         env = env.env(policy)  # type: ignore[arg-type]
     check_whole_numbers(episodes=episodes)
     if len(env.batch_size) > 1:

@@ -178,10 +178,29 @@ HASHED_AT_ONCE = 2**26
 """The bytes of data that are hashed at once."""
 
 
+STATE_FORMAT = 7
+"""A version in every identity; it is raised whenever the same options lead to other weights."""
+
+
+def run_identity(data: TensorDictBase | str, config: Any, **parts: Any) -> dict[str, Any]:
+    """Return what identifies a training run: options, data, parts, and the version of the code.
+
+    Args:
+        data: the demonstrations, or their digest.
+        config: the options.
+
+    Keyword Args:
+        parts: what is trained and with what, by name: objects, or JSON.
+    """
+    digest = data if isinstance(data, str) else data_digest(data)
+    named_parts = {name: part_identity(part) for name, part in parts.items()}
+    return {"config": config, "data": digest, **named_parts, "format": STATE_FORMAT}
+
+
 def part_identity(part: Any) -> Any:
-    """Return a part's configuration, or a function's name, with a digest of its untrained values."""
-    if part is None:
-        return None
+    """Return JSON as it is; else a configuration, or a function's name, with a digest of untrained values."""
+    if part is None or isinstance(part, dict | str | bool):
+        return part
     part = uncompiled(part)
     config = getattr(part, "config", None)
     if config is None:

@@ -1,94 +1,149 @@
-"""A task of the demonstrations in a file, played in the simulator that recorded them."""
+"""The environments in which demonstrations were recorded, by their kind."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
+
+from warmprior.checks import given
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.images import check_images
-from warmprior.data.replay import DatasetIndex, DemonstrationReplay
-from warmprior.envs.description import environment_description, robosuite_parts
-from warmprior.envs.simulator import task_env_args
-from warmprior.envs.tasks import TASKS
-from warmprior.keys import ACTION, OBSERVATION, STATE
-from warmprior.modules.normalize import Normalizer, bound_of
-from warmprior.modules.trend import RestingPose
-from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.data.images import check_images, renderer_versions
+from warmprior.data.index import DatasetIndex
+from warmprior.envs.description import environment_description, registered_description, robosuite_parts
+from warmprior.envs.env_args import modernize_env_args
+from warmprior.envs.gymnasium import registered_env
+from warmprior.io.files import digest_of
+from warmprior.keys import ACTION
+from warmprior.tasks.task import Play
+from warmprior.transforms.absolute_actions import Actions
 
 
-def opened(place: Path | str, task: str | None = None, mask: str | None = None) -> Demonstrations:
-    """Open the demonstrations at a place, with the task's environment if they do not describe one."""
-    return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
+@dataclass(frozen=True)
+class RecordedEnvironment:
+    """The environment in which demonstrations were recorded, as policies play it.
 
-
-def task_name(dataset: DemonstrationReplay | DatasetIndex) -> str:
-    """Return the short name of a dataset's task, or its environment's name if no task has it."""
-    task = dataset.task
-    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
-
-
-def image_names(cameras: Sequence[str]) -> list[str]:
-    """Return the names of the cameras' images in files."""
-    return [f"{camera}_image" for camera in cameras]
-
-
-def recorded_task(
-    dataset: DemonstrationReplay, images: Mapping[str, Any] | None, **options: Any
-) -> dict[str, Any]:
-    """Return data, environment and units of demonstrations in robosuite, as arguments of :class:`Task`.
-
-    The options are those of :func:`~warmprior.envs.environment_description`.
+    Attributes:
+        index: the demonstrations, with the observations that policies see.
+        make_env: builds it.
+        description: the description that a saved policy keeps, see :func:`~warmprior.envs.environment_of`.
+        name: short name of the task.
+        style: style of the demonstrations.
+        adapters: transforms directly after it, as arguments of :func:`~warmprior.policy_transforms`.
+        units: raw sizes of one normalised unit, see :meth:`Normalizer.fit`.
+        poses: the columns of grippers' poses, if actions are absolute poses.
+        facts: facts about the data for results.
+        digest: digest of the data, if that of the values is not to be computed.
     """
-    low_dim_keys = None
-    if images is None and (dataset.task is None or dataset.observation_keys != dataset.task.low_dim_keys):
-        low_dim_keys = dataset.observation_keys
-    options |= {"images": images, "low_dim_keys": low_dim_keys}
-    description = environment_description(dataset.env_args, **options)
+
+    index: DatasetIndex
+    make_env: Callable[..., EnvBase]
+    description: Mapping[str, Any]
+    name: str
+    style: str
+    adapters: Mapping[str, Transform] = field(default_factory=dict)
+    units: Mapping[NestedKey, Tensor] | None = None
+    poses: Tensor | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    digest: str | None = None
+
+
+def _robosuite(
+    demonstrations: Demonstrations,
+    index: DatasetIndex,
+    env_args: Mapping[str, Any],
+    observations: Sequence[str] | None,
+    images: Sequence[str],
+    *,
+    actions: Actions,
+    play: Play,
+) -> RecordedEnvironment:
+    task = demonstrations.task
+    if isinstance(task, str) and task != index.task_name:
+        raise ValueError(
+            f"{demonstrations} holds demonstrations of {index.task_name}, not of {task}: correct the task"
+        )
+    if images and actions == "absolute":
+        raise ValueError("images go with pose deltas: leave out actions='absolute', or the images")
+    pictured, low_dim_keys, style = None, None, demonstrations.style or "ph"
+    if images:
+        # As in robomimic, image policies also see the robot's state, but not that of the objects.
+        robot = [key for key in index.observation_keys if key != "object"]
+        index = demonstrations.index(robot if observations is None else observations, images)
+        check_images(demonstrations, index, play.fast_rendering)
+        pictured = {
+            "cameras": [key.removesuffix("_image") for key in index.image_keys],
+            "size": index.image_size,
+            "fast_rendering": play.fast_rendering,
+            "low_dim_keys": list(index.observation_keys),
+        }
+    elif index.task is None or index.observation_keys != index.task.low_dim_keys:
+        low_dim_keys = index.observation_keys
+    description = environment_description(
+        modernize_env_args(env_args),
+        style,
+        actions,
+        pictured,
+        low_dim_keys=low_dim_keys,
+        horizon=play.horizon,
+    )
     make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: errors and sigma have the same meaning in both spaces, and the loss does
     # not give positions, whose range is large, little weight compared with the gripper.
-    absolute = adapters.get("actions")
-    units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
-    vector = OBSERVATION if images is None else (OBSERVATION, STATE)
-    normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
-    data = normalizer.normalize(dataset.data.exclude("next"))
-    return {
-        "data": data,
-        "make_env": make_env,
-        "normalizer": normalizer,
-        "adapters": adapters,
-        "rest": None if absolute is None else RestingPose(dataset.pose_columns, normalizer),
-        "clip": bound_of(data[ACTION]),
-        "environment": description,
-    }
+    absolute: Any = adapters.get("actions")
+    demos = None if index.whole else demonstrations.demos
+    sha256 = demonstrations.digest(index)
+    # The default is left out.
+    space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}
+    space |= {} if pictured is None else {"obs": "image", "images": pictured}
+    space |= {} if observations is None else {"observation_keys": list(observations)}
+    return RecordedEnvironment(
+        index,
+        make_env,
+        description,
+        index.task_name,
+        style,
+        adapters=adapters,
+        units=None if absolute is None else {ACTION: absolute.one_step},
+        poses=None if absolute is None else index.pose_columns,
+        facts={"sha256": sha256, **space},
+        # Images depend on the installed renderer.
+        digest=digest_of(sha256, demos, space, pictured and renderer_versions()),
+    )
 
 
-def read_steps(
+def _gymnasium(
     demonstrations: Demonstrations,
+    index: DatasetIndex,
+    environment: Mapping[str, Any],
+    observations: Sequence[str] | None,
+    images: Sequence[str],
     *,
-    absolute_actions: bool = False,
-    observation_keys: Sequence[str] | None = None,
-    cameras: Sequence[str] = (),
-    fast_rendering: bool = False,
-    demos: int | None = None,
-) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
-    """Return the demonstrations as policies see them, and the options of their images, if any."""
-    if not cameras:
-        options: Mapping[str, Any] = {"absolute_actions": absolute_actions}
-        return demonstrations.replay(**options, observation_keys=observation_keys, demos=demos), None
-    if absolute_actions:
-        raise ValueError("images go with pose deltas: leave out actions='absolute', or the cameras")
-    check_images(demonstrations, cameras, fast_rendering)
-    # As in robomimic, image policies also see the robot's state, but not that of the objects.
-    vector = [key for key in demonstrations.index(demos=demos).observation_keys if key != "object"]
-    vector = vector if observation_keys is None else list(observation_keys)
-    names = image_names(cameras)
-    dataset = demonstrations.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
-    return dataset, {
-        "cameras": list(cameras),
-        "size": dataset.image_size,
-        "fast_rendering": fast_rendering,
-        "low_dim_keys": vector,
-    }
+    play: Play,
+    **_: Any,
+) -> RecordedEnvironment | None:
+    if images:
+        return None
+    environment = {**environment, "observation_keys": list(index.observation_keys)}
+    environment |= given(max_episode_steps=play.horizon)
+    return RecordedEnvironment(
+        index,
+        # Unknown wrappers raise an error only when it is built, which training does not need.
+        partial(registered_env, environment),
+        registered_description(environment),
+        demonstrations.title,
+        demonstrations.style or "human",
+    )
+
+
+KINDS: dict[str, Callable[..., RecordedEnvironment | None]] = {
+    "robosuite": _robosuite,
+    "gymnasium": _gymnasium,
+}
+"""The environments that formats name, see :meth:`Demonstrations.environment`."""

@@ -23,12 +23,11 @@ from warmprior.modules.network import device_of, uncompiled
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.saving.checkpoint import (
     RunState,
-    data_digest,
     fixed_identity,
     named,
-    part_identity,
     restore_rng,
     rng_tensors,
+    run_identity,
     select,
 )
 from warmprior.saving.policies import check_saveable, load_policy, policy_config, save_policy
@@ -39,9 +38,6 @@ from warmprior.transforms.window import window_replay_buffer
 
 WINDOWS_SEED = 1_000_003
 """An offset of the seed of a separate window generator, so that it does not repeat the source's draws."""
-
-STATE_FORMAT = 7
-"""A version in every state's identity; it is raised whenever the same options lead to other weights."""
 
 
 class BehaviourCloning:
@@ -136,21 +132,20 @@ class BehaviourCloning:
         self.iteration = 0
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
-        self.identity = {
-            "config": asdict(config) | {"weighting": self.update.loss_module.weighting},
-            "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
-            "prior": part_identity(actor.prior),
-            "start": part_identity(actor.start),
-            "coupling": part_identity(coupling),
-            "network": part_identity(actor.network),
-            "policy": {
+        self.identity = run_identity(
+            data.select(observation_key, ACTION, EPISODE),
+            asdict(config) | {"weighting": self.update.loss_module.weighting},
+            prior=actor.prior,
+            start=actor.start,
+            coupling=coupling,
+            network=actor.network,
+            policy={
                 "clip": actor.sampling.clip,
                 "max_nfe": actor.sampling.max_nfe,
                 "normalizer": fixed_identity(actor.normalizer),  # data in other units may be equal
             },
-            "device": self.generator.device.type,  # a generator's state is of one kind of device
-            "format": STATE_FORMAT,
-        }
+            device=self.generator.device.type,  # a generator's state is of one kind of device
+        )
         torch.manual_seed(config.seed)
         self._differ()
         self._state = RunState(self.directory, self.identity)

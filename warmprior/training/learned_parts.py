@@ -20,15 +20,14 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.saving.checkpoint import (
     check_identity,
-    data_digest,
     load_state,
     module_tensors,
     restore_module,
     restoring,
+    run_identity,
     save_state,
 )
 from warmprior.saving.policies import NoLargerThan
-from warmprior.training.cloning import STATE_FORMAT
 from warmprior.training.options import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer, without_images
 
@@ -74,18 +73,15 @@ def learned(
     path = Path(directory) / f"{'prior' if is_prior else 'start'}.safetensors"
     data = without_images(data)
     steps = max(1, round(SHARE * training.iterations))
-    identity = {
-        "part": part.config(),
-        "config": {
-            "iterations": steps,
-            "seed": training.seed,
-            "cold_probability": training.cold_probability,
-            "observation_steps": observation_steps,
-            "lengths": [lengths.chunk_length, lengths.prediction_length, lengths.history_length],
-        },
-        "data": data_digest(data.select(keys.OBSERVATION, keys.ACTION, keys.EPISODE)),
-        "format": STATE_FORMAT,
+    options = {
+        "iterations": steps,
+        "seed": training.seed,
+        "cold_probability": training.cold_probability,
+        "observation_steps": observation_steps,
+        "lengths": [lengths.chunk_length, lengths.prediction_length, lengths.history_length],
     }
+    seen = data.select(keys.OBSERVATION, keys.ACTION, keys.EPISODE)
+    identity = run_identity(seen, options, part=part.config())
     with torch.random.fork_rng([]):
         with leader_first():  # other processes find the file
             if not path.exists():

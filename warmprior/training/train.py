@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -32,6 +32,9 @@ from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_replay_buffer, without_images
+
+if TYPE_CHECKING:
+    from warmprior.data import Demonstrations
 
 
 def new_policy(
@@ -74,12 +77,12 @@ def new_policy(
 
 
 def train_policy(
-    demonstrations: str | Path | TensorDictBase | ReplayBuffer | Task,
+    demonstrations: str | Path | Demonstrations | TensorDictBase | ReplayBuffer | Task,
     prior: Prior,
     directory: str | Path | None = None,
     *,
-    observation_keys: Sequence[str] | None = None,
-    image_keys: Sequence[str] = (),
+    observations: Sequence[str] | None = None,
+    images: Sequence[str] = (),
     nfe: int | None = None,
     network: NetworkOptions | None = None,
     training: TrainingConfig | None = None,
@@ -100,17 +103,18 @@ def train_policy(
     training uses one thread so that results are reproducible.
 
     Args:
-        demonstrations: a file or dataset that :meth:`Task.open` reads, such as ``"demos.hdf5"``,
-            ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``; steps in memory, or a replay buffer of
-            them, in :meth:`Task.of`'s format; or a :class:`Task`.
+        demonstrations: a :class:`Task`; or demonstrations, or their place, such as ``"demos.hdf5"``,
+            ``"lerobot:user/name"`` or ``"minari:D4RL/door/human-v2"``
+            (:func:`~warmprior.data.open_demonstrations`); or steps in memory, or a replay buffer of them, as
+            for :func:`~warmprior.data.demonstrations_of`.
         prior: the source distribution. What it or ``start`` learns before the flow (:meth:`Prior.fit`), in a
             quarter of the iterations, is saved with the policy; the given object stays as it is.
         directory: folder where the run is saved and resumed, see :class:`BehaviourCloning`; if omitted,
             nothing is saved and an interrupted run is lost.
 
     Keyword Args:
-        observation_keys: observations to read from the file or dataset, see :meth:`Task.open`.
-        image_keys: images to read from the file or dataset, see :meth:`Task.open`.
+        observations: observations of policies, see :class:`Task`; not with a task, which has its own.
+        images: images of policies, see :class:`Task`.
         nfe: network evaluations per chunk, saved with the policy; see :class:`~warmprior.Sampling`.
         network: options of the velocity network.
         training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
@@ -157,22 +161,7 @@ def train_policy(
     if see_history and any(map(learns_first, (prior, start))):  # it would be given another observation
         raise ValueError("a source or start point that learns before the flow needs see_history=False")
     check_device(device)  # before the demonstrations are read
-    if isinstance(demonstrations, str | Path):
-        task = Task.open(demonstrations, observation_keys=observation_keys, image_keys=image_keys)
-    elif observation_keys is not None or image_keys:
-        raise ValueError("observation_keys and image_keys are only for files and datasets: leave them out")
-    elif isinstance(demonstrations, Task):
-        task = demonstrations
-    elif isinstance(demonstrations, TensorDictBase | ReplayBuffer):
-        if getattr(demonstrations, "write_count", 0) > len(demonstrations):
-            raise ValueError("the replay buffer holds its last steps first: give its storage room for all")
-        steps_of = demonstrations if isinstance(demonstrations, TensorDictBase) else demonstrations[:]
-        task = Task.of("demonstrations", steps_of)
-    else:
-        raise TypeError(
-            "train_policy takes a file or dataset, a TensorDict or replay buffer of steps, or a Task, got "
-            f"{type(demonstrations).__name__}"
-        )
+    task = _task_of(demonstrations, {"observations": observations, "images": images})
     home = torch.device(device)
     if directory is None and world_size() > 1:
         raise ValueError("processes that train together need a directory that all of them see")
@@ -212,6 +201,31 @@ def train_policy(
         cloning.run(description, progress)
         from_leader(lambda: None)  # other processes wait until the first has written the policy
         return load_policy(cloning.policy_path())
+
+
+def _task_of(demonstrations: Any, chosen: dict[str, Any]) -> Task:
+    """Return the task of what :func:`train_policy` is given."""
+    # Imported here, since readers are not needed to import the training.
+    from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations
+
+    if isinstance(demonstrations, str | Path):
+        demonstrations = open_demonstrations(demonstrations)
+    if isinstance(demonstrations, Demonstrations):
+        return Task(demonstrations, **chosen)
+    if any(chosen.values()):
+        raise ValueError("observations and images are only for files and datasets: leave them out")
+    if isinstance(demonstrations, Task):
+        return demonstrations
+    if isinstance(demonstrations, ReplayBuffer):
+        if getattr(demonstrations, "write_count", 0) > len(demonstrations):
+            raise ValueError("the replay buffer holds its last steps first: give its storage room for all")
+        demonstrations = demonstrations[:]
+    if not isinstance(demonstrations, TensorDictBase):
+        raise TypeError(
+            "train_policy takes a file or dataset, a TensorDict or replay buffer of steps, or a Task, got "
+            f"{type(demonstrations).__name__}"
+        )
+    return Task(demonstrations_of(demonstrations))
 
 
 TREND_BATCHES = 16

@@ -50,7 +50,7 @@ class WarmFlowConfig(PreTrainedConfig):
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
         precondition: precondition the network by the moments of source and data, see PreconditionedNetwork.
-        joint_key: the observation whose numbers absolute actions set, such as ``observation.state``; empty if
+        joints: the observation whose numbers absolute actions set, such as ``observation.state``; empty if
             there is none. By default ``auto``: ``observation.state`` if the dataset gives it the names of the
             actions, and the numbers are near. Training replaces ``auto`` by what it found.
         ema_rate: decay of the averaged weights, which are used at decisions.
@@ -72,7 +72,7 @@ class WarmFlowConfig(PreTrainedConfig):
     cold_probability: float = 0.0
     nfe: int = DEFAULT_NFE
     precondition: bool = True
-    joint_key: str = "auto"
+    joints: str = "auto"
     ema_rate: float = 0.995
     network: str = ""
     embedding_dim: int = 384
@@ -108,7 +108,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""
-        names = ["n_obs_steps", "precondition", "joint_key", "network", "embedding_dim", "num_layers"]
+        names = ["n_obs_steps", "precondition", "joints", "network", "embedding_dim", "num_layers"]
         names += ["num_heads", "image_size", "crop_size", "normalization_mapping"]
         return {
             **{name: getattr(self, name) for name in names},
@@ -127,7 +127,7 @@ class WarmFlowConfig(PreTrainedConfig):
     def joint_columns(self, key: str) -> list[int]:
         """Return for each action the column of the observation, within ``key``, that it sets, or -1."""
         if key not in self.observed:
-            raise ValueError(f"--policy.joint_key must be one of {', '.join(self.observed)}, got {key!r}")
+            raise ValueError(f"--policy.joints must be one of {', '.join(self.observed)}, got {key!r}")
         widths = [self.input_features[name].shape[0] for name in self.observed]
         first, width = sum(widths[: self.observed.index(key)]), widths[self.observed.index(key)]
         return [first + i if i < width else -1 for i in range(self.action_feature.shape[0])]
@@ -153,10 +153,10 @@ class WarmFlowConfig(PreTrainedConfig):
             raise ValueError("warm_flow needs observation.state or observation.environment_state: add one")
         if self.action_feature is None:
             raise ValueError("warm_flow needs the feature 'action': add it to the dataset")
-        if self.joint_key not in ("", "auto"):
-            self.joint_columns(self.joint_key)
+        if self.joints not in ("", "auto"):
+            self.joint_columns(self.joints)
             if not self.precondition:
-                raise ValueError("--policy.joint_key needs --policy.precondition=true")
+                raise ValueError("--policy.joints needs --policy.precondition=true")
         check_between(1, self.make_prior().chunk_length, n_action_steps=self.n_action_steps)
 
     def get_optimizer_preset(self) -> AdamWConfig:

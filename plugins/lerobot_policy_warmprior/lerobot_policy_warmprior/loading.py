@@ -110,8 +110,8 @@ class WholePolicy(nn.Module):
             config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
         if saved.get("type") == cls.name:
             kept = PreTrainedConfig.from_pretrained(place, **hub)
-            if getattr(config, "joint_key", None) == "auto":  # what the weights were trained with
-                config.joint_key = kept.joint_key
+            if getattr(config, "joints", None) == "auto":  # what the weights were trained with
+                config.joints = kept.joints
             check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
         misfit: str | None
         try:

@@ -37,7 +37,7 @@ from warmprior import (
     keys,
 )
 from warmprior.checks import check_choice
-from warmprior.data import LeRobotDemonstrations
+from warmprior.data import open_demonstrations
 from warmprior.history import window_history
 from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
@@ -168,7 +168,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         self, network: VelocityNetwork, prior: Prior, dataset_meta: Any
     ) -> PreconditionedNetwork:
         """Precondition the network by the moments of source and data; a saved policy's are in its file."""
-        key, trend = self.config.joint_key, None
+        key, trend = self.config.joints, None
         if dataset_meta is None:
             if key not in ("", "auto"):
                 resting = RestingJoints(self.config.joint_columns(key))
@@ -186,8 +186,9 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 "set --dataset.streaming=false, or --policy.precondition=false"
             )
         episodes = training_episodes(dataset_meta)
-        chosen: Any = {"observation_keys": self.config.observed, "episodes": episodes}
-        steps = LeRobotDemonstrations(dataset_meta.root, **chosen).data.copy()
+        steps = open_demonstrations(f"lerobot:{dataset_meta.root}", episodes=episodes).steps(
+            self.config.observed
+        )
         # LeRobot's own step, because it maps a constant dimension to -1.
         names = (*self.config.observed, keys.ACTION)
         features = {**self.config.input_features, **self.config.output_features}
@@ -206,7 +207,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
 
     def _resting_joints(self, steps: TensorDictBase, dataset_meta: Any) -> RestingJoints | None:
         """Return the resting action of absolute joint targets, and write their key into the configuration."""
-        config, asked = self.config, self.config.joint_key
+        config, asked = self.config, self.config.joints
         key = asked
         if asked == "auto":
             names = [dataset_meta.features.get(name, {}).get("names") for name in (STATE, keys.ACTION)]
@@ -223,15 +224,15 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             rest = RestingJoints(torch.tensor(config.joint_columns(key)), Normalizer(*ends))
             worst = rest.farthest(steps[keys.OBSERVATION], steps[keys.ACTION])
             if worst is None:
-                config.joint_key = key
-                logging.info("the actions are absolute targets of %s: joint_key=%s", key, key)
+                config.joints = key
+                logging.info("the actions are absolute targets of %s: joints=%s", key, key)
                 return rest
             if asked != "auto":
                 raise ValueError(
                     f"the actions are not near {key}, which they should set, least of all action {worst}: "
-                    "use the same order and units, or --policy.joint_key="
+                    "use the same order and units, or --policy.joints="
                 )
-        config.joint_key = ""
+        config.joints = ""
         return None
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:

@@ -8,33 +8,33 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, override
 
 import numpy as np
 from torch import Tensor
 
-from warmprior.data import replay
-from warmprior.data.replay import (
+from warmprior.data import index as indices
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.index import (
     BLOCK,
     DatasetError,
     DatasetIndex,
     DemonstrationReader,
-    DemonstrationReplay,
-    Opened,
     check_count,
     check_env_args,
     common_size,
     declared_poses,
+    no_such,
     pose_keys,
     store_finite,
-    unknown,
 )
 from warmprior.envs.tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
+from warmprior.io.files import file_digest
 
 if TYPE_CHECKING:
     import h5py
@@ -50,7 +50,7 @@ _OBSERVE = "use the low_dim file, or replay its states (python -m warmprior obse
 
 def reading(parent: h5py.Group, name: str) -> AbstractContextManager[None]:
     """Turn any error inside into a DatasetError that names the file and the object below ``parent``."""
-    return replay.reading(_place(parent, name), _AGAIN)
+    return indices.reading(_place(parent, name), _AGAIN)
 
 
 def names(group: h5py.Group) -> list[str]:
@@ -176,12 +176,6 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
         yield file
 
 
-def read_masks(path: str | Path) -> dict[str, set[str]]:
-    """Return the names of the demos in each mask of a robomimic file."""
-    with open_robomimic(path) as file:
-        return {name: _mask(file, name) for name in _mask_names(file)}
-
-
 def _mask_names(file: h5py.File) -> list[str]:
     group = member(file, "mask", "group")
     return [] if group is None else names(group)
@@ -189,7 +183,7 @@ def _mask_names(file: h5py.File) -> list[str]:
 
 def _mask(file: h5py.File, filter_key: str) -> set[str]:
     if filter_key not in (masks := _mask_names(file)):
-        raise unknown(file.filename, "filter key", filter_key, masks)
+        raise no_such(file.filename, "filter key", filter_key, masks)
     entries, demos = member(file["mask"], filter_key, "dataset"), len(names(file["data"]))
     what = f"{file.filename}: mask/{filter_key}"
     if entries is None or entries.ndim != 1 or entries.dtype.kind not in "SO":
@@ -233,16 +227,6 @@ def _check_total(file: h5py.File, steps: int) -> None:
         )
 
 
-def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
-    """Return the rendering options of a file's images, and a demo's first simulator state, if present."""
-    with open_robomimic(path) as file:
-        rendering = read_described(file, "rendering")
-        states = member(file, f"data/{demo}/states", "dataset")
-        with reading(file, f"data/{demo}/states"):
-            state = np.asarray(states[0], np.float64) if states is not None and states.size else None
-    return rendering, state
-
-
 def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]:
     """Return the steps of a demo and the width of each key, after checking that they agree."""
     what, steps, widths = _place(demo), 0, {}
@@ -255,7 +239,7 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
             continue
         if dataset is None:
             kind, group = ("observation", observations) if key.startswith("obs/") else ("dataset", demo)
-            raise unknown(what, kind, key.removeprefix("obs/"), names(group))
+            raise no_such(what, kind, key.removeprefix("obs/"), names(group))
         shape: tuple[int, ...] = dataset.shape or ()
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0 or shape[:1] != (steps,):
@@ -287,10 +271,10 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
             others = [name for name in names(demo["obs"]) if name.endswith("_image") and name != key]
             if not others:
                 raise DatasetError(
-                    f"{_place(demo)} has no images: leave image_keys out, or render them from its states "
+                    f"{_place(demo)} has no images: leave the images out, or render them from its states "
                     "(python benchmarks/demonstrations.py render)"
                 )
-            raise unknown(_place(demo), "images", key, others)
+            raise no_such(_place(demo), "images", key, others)
         shape: tuple[int, ...] = images.shape or ()
         side = shape[1] if len(shape) == 4 else 0
         if images.dtype != "uint8" or shape != (steps, side, side, 3):
@@ -300,96 +284,6 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
     return sizes
 
 
-def read_index(
-    path: str | Path,
-    *,
-    filter_key: str | None = None,
-    observation_keys: Sequence[str] | None = None,
-    image_keys: Sequence[str] = (),
-    poses: bool = False,
-    demos: int | None = None,
-) -> DatasetIndex:
-    """Return the index of a robomimic file, from its names, shapes and attributes alone.
-
-    Options are those of :class:`~warmprior.data.RobomimicDemonstrations`; ``poses`` also requires the hand
-    pose of every arm.
-    """
-    path = Path(path)
-    with open_robomimic(path) as file:
-        selected = selected_demos(file, filter_key)
-        check_count(path, demos, len(selected))
-        selected = selected[:demos]
-        observations = member(file, f"data/{selected[0]}/obs", "group")
-        available = () if observations is None else tuple(names(observations))
-        described = read_described(file, "env_args")
-        if described is None and observations is None:
-            raise DatasetError(
-                f"{path}: its demos have no group 'obs': recordings of robosuite hold states without "
-                f"observations: {_OBSERVE}"
-            )
-        # A file without a description comes from a robot, or from another simulator than robosuite, whose
-        # type is 1 in robomimic.
-        if isinstance(described, dict) and described.get("type", 1) != 1:
-            described = None
-        env_args = {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
-        task = task_of_env(env_args) if env_args else None
-        if observation_keys is not None:
-            keys = tuple(observation_keys)
-        elif task is not None:
-            keys = task.low_dim_keys
-        else:
-            usual = [key for key in low_dim_keys(arms=len(available)) if key in available]
-            # Joints and velocities of a robot say again where its gripper is.
-            known = {key.partition("_")[0] for key in usual} - {"object"}
-            others = [k for k in available if k not in usual and k.partition("_")[0] not in known]
-            keys = (*usual, *(key for key in others if _is_vector(observations, key)))
-        obs_names = [f"obs/{key}" for key in keys]
-        if poses:
-            actions = member(file, f"data/{selected[0]}/actions", "dataset")
-            width = actions.shape[-1] if actions is not None and actions.shape else 0
-            obs_names += [f"obs/{key}" for key in pose_keys(width)]
-        expected, whose = {}, env_args.get("env_name", str(path))
-        if task is not None:
-            if declared_poses(path, env_args) is not None:  # other controllers have other widths
-                expected["actions"] = task.action_dim
-            if observation_keys is None:
-                expected["obs/object"] = task.object_dim
-        lengths: list[int] = []
-        sides: dict[int, str] = {}
-        for name in selected:
-            demo = member(file["data"], name, "group")
-            if demo is None:  # the name is listed, but a damaged index hides the demo
-                raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
-            steps, widths = _widths(demo, obs_names)
-            if lengths and widths.keys() != expected.keys():
-                raise DatasetError(f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'")
-            for key, width in expected.items():
-                if widths[key] != width:
-                    leave = "" if key == "actions" else ", or choose observation_keys"
-                    raise DatasetError(
-                        f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. Use "
-                        f"demos of one environment and controller{leave}."
-                    )
-            expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
-            lengths.append(steps)
-            sides = _image_sizes(demo, image_keys, steps) | sides
-        if filter_key is None and demos is None:
-            _check_total(file, sum(lengths))
-    return DatasetIndex(
-        path=path,
-        demos=selected,
-        lengths=tuple(lengths),
-        observation_keys=keys,
-        observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
-        image_keys=tuple(image_keys),
-        image_size=common_size(path, sides),
-        available_keys=available,
-        action_dim=widths["actions"],
-        env_args=env_args,
-        task=task,
-    )
-
-
 class RobomimicReader(DemonstrationReader):
     """A reader of an open file's values."""
 
@@ -397,7 +291,7 @@ class RobomimicReader(DemonstrationReader):
         self.file = file
 
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of one array of a demo, block by block; ``out`` may be a strided view."""
+        """Read block by block; ``out`` may be a strided view."""
         dataset: Any = member(self.file, f"data/{demo}/{key}", "dataset")
         if dataset is None and key == "rewards":
             out[...] = 0
@@ -410,7 +304,7 @@ class RobomimicReader(DemonstrationReader):
             store_finite(block, rows, what, _LEAVE_OUT, first + start)
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the images of a demo, block by block."""
+        """Read block by block."""
         name, target = f"data/{demo}/obs/{key}", out.numpy()
         images: Any = member(self.file, name, "dataset")
         rows = max(1, _IMAGE_BYTES // max(1, out[0].numel()))
@@ -423,59 +317,141 @@ class RobomimicReader(DemonstrationReader):
         return f"{self.file.filename}: data/{demo}/{key}"
 
 
-class RobomimicDemonstrations(DemonstrationReplay):
-    """The demonstrations of a robomimic or MimicGen HDF5 file, as one immutable TorchRL replay buffer.
+class RobomimicDemonstrations(Demonstrations):
+    """The demonstrations of a robomimic or MimicGen HDF5 file.
 
-    The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
-    the order of the demos' numbers:
-
-    - ``"observation"`` ``[N, d_o]`` float32, the concatenated observation keys; with images it is nested:
-      ``("observation", "state")`` ``[N, d_s]``, and each image uint8 ``[N, 3, size, size]``;
-    - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
-    - ``("next", "reward")`` ``[N, 1]`` float32, zeros if none is recorded;
-    - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
-      on the last step of each demo; terminated there if its reward is that of a solved task (robosuite's
-      ``reward_scale``, 1 by default), else truncated;
-    - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row number.
-
-    Names, shapes and masks are checked before values are read.
-
-    Args:
-        place: an HDF5 file.
-        filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
-        demos: number of demos to take, the first ones by their numbers; all if ``None``.
-        observation_keys: observations to concatenate; by default those of the task, or for an
-            unknown environment the object, every robot's pose and gripper, and all other vectors but
-            those of a robot with such a pose or gripper (``robot0_...``).
-        image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; use
-            ``storage="memmap"`` for many images.
-        absolute_actions: True turns the recorded pose deltas into absolute poses
-            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm. Recorded poses that
-            the file declares as deltas (``low_dim_abs.hdf5``) are not changed.
-        as_recorded: True reads such poses without ``absolute_actions`` too, as stored in the file.
-        storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk.
-        scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
-        **kwargs: TorchRL's ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` and
-            ``generator``.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        DatasetError: if the file is invalid; the message names the demo and key.
-        ValueError: if ``storage`` is unknown, or ``absolute_actions`` is True for a controller without pose
-            deltas.
-        OSError: if there is no space for memory maps.
-
-    Examples:
-        >>> from warmprior.data import RobomimicDemonstrations
-        >>> data = RobomimicDemonstrations("square.hdf5", batch_size=256)  # doctest: +SKIP
-        >>> data.sample()["observation"].shape  # doctest: +SKIP
-        torch.Size([256, 23])
-        >>> RobomimicDemonstrations("nowhere.hdf5")
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
+    By default the observations are those of the task, or for an unknown environment the object, every robot's
+    pose and gripper, and all other vectors but those of a robot with such a pose or gripper (``robot0_...``).
     """
 
-    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
-        index = read_index(place, **chosen)
-        return index, RobomimicReader(stack.enter_context(open_robomimic(place)))
+    prefix = ""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return Path(self.place)
+
+    @property
+    @override
+    def title(self) -> str:
+        return self.path.stem
+
+    @override
+    def check(self) -> None:
+        if not self.path.is_file():
+            folder = (self.path / "meta" / "info.json").is_file()
+            hint = f"; for a LeRobotDataset write lerobot:{self.place}" if folder else ""
+            raise FileNotFoundError(f"{self.place}: no such file{hint}")
+
+    @override
+    def resolved(self) -> str:
+        return str(self.path.resolve())
+
+    @override
+    def index(
+        self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
+    ) -> DatasetIndex:
+        path = self.path
+        with open_robomimic(path) as file:
+            selected = selected_demos(file, self.mask)
+            check_count(path, self.demos, len(selected))
+            count, selected = len(selected), selected[: self.demos]
+            group = member(file, f"data/{selected[0]}/obs", "group")
+            available = () if group is None else tuple(names(group))
+            described = read_described(file, "env_args")
+            if described is None and group is None:
+                raise DatasetError(
+                    f"{path}: its demos have no group 'obs': recordings of robosuite hold states without "
+                    f"observations: {_OBSERVE}"
+                )
+            # A file without a description comes from a robot, or from another simulator than robosuite, whose
+            # type is 1 in robomimic.
+            if isinstance(described, dict) and described.get("type", 1) != 1:
+                described = None
+            env_args = (
+                {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
+            )
+            task = task_of_env(env_args) if env_args else None
+            if observations is not None:
+                keys = tuple(observations)
+            elif task is not None:
+                keys = task.low_dim_keys
+            else:
+                usual = [key for key in low_dim_keys(arms=len(available)) if key in available]
+                # Joints and velocities of a robot say again where its gripper is.
+                known = {key.partition("_")[0] for key in usual} - {"object"}
+                others = [k for k in available if k not in usual and k.partition("_")[0] not in known]
+                keys = (*usual, *(key for key in others if _is_vector(group, key)))
+            obs_names = [f"obs/{key}" for key in keys]
+            if poses:
+                actions = member(file, f"data/{selected[0]}/actions", "dataset")
+                width = actions.shape[-1] if actions is not None and actions.shape else 0
+                obs_names += [f"obs/{key}" for key in pose_keys(width)]
+            expected, whose = {}, env_args.get("env_name", str(path))
+            if task is not None:
+                if declared_poses(path, env_args) is not None:  # other controllers have other widths
+                    expected["actions"] = task.action_dim
+                if observations is None:
+                    expected["obs/object"] = task.object_dim
+            lengths: list[int] = []
+            sides: dict[int, str] = {}
+            for name in selected:
+                demo = member(file["data"], name, "group")
+                if demo is None:  # the name is listed, but a damaged index hides the demo
+                    raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
+                steps, widths = _widths(demo, obs_names)
+                if lengths and widths.keys() != expected.keys():
+                    raise DatasetError(
+                        f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'"
+                    )
+                for key, width in expected.items():
+                    if widths[key] != width:
+                        leave = "" if key == "actions" else ", or choose observations"
+                        raise DatasetError(
+                            f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. "
+                            f"Use demos of one environment and controller{leave}."
+                        )
+                expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
+                lengths.append(steps)
+                sides = _image_sizes(demo, images, steps) | sides
+            if self.mask is None and self.demos is None:
+                _check_total(file, sum(lengths))
+        return DatasetIndex(
+            path=path,
+            demos=selected,
+            lengths=tuple(lengths),
+            observation_keys=keys,
+            observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
+            image_keys=tuple(images),
+            image_size=common_size(path, sides),
+            available_keys=available,
+            action_dim=widths["actions"],
+            env_args=env_args,
+            task=task,
+            whole=len(selected) == count,
+            rate=env_args["env_kwargs"].get("control_freq", 20) if env_args else None,
+        )
+
+    @contextmanager
+    @override
+    def reader(self, index: DatasetIndex) -> Iterator[RobomimicReader]:
+        with open_robomimic(self.path) as file:
+            yield RobomimicReader(file)
+
+    @override
+    def contents(self, index: DatasetIndex) -> str:
+        return file_digest(self.path)
+
+    @override
+    def origin(self, index: DatasetIndex) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+        with open_robomimic(self.path) as file:
+            rendering = read_described(file, "rendering")
+            states = member(file, f"data/{index.demos[0]}/states", "dataset")
+            with reading(file, f"data/{index.demos[0]}/states"):
+                state = np.asarray(states[0], np.float64) if states is not None and states.size else None
+        return rendering, state
+
+    def masks(self) -> dict[str, set[str]]:
+        """Return the names of the demos in each mask."""
+        with open_robomimic(self.path) as file:
+            return {name: _mask(file, name) for name in _mask_names(file)}

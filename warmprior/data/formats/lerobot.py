@@ -1,32 +1,32 @@
-"""LeRobot's demonstrations: the values of a LeRobotDataset v3 as a replay buffer, or as steps."""
+"""LeRobot's demonstrations: LeRobotDatasets v3."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from warmprior.checks import check_shape
+from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.lerobot_index import (
     REWARD,
     SUCCESS,
     LeRobotIndex,
+    download_lerobot,
     episode_file,
+    is_remote,
     read_lerobot_index,
 )
-from warmprior.data.replay import (
-    DemonstrationReader,
-    DemonstrationReplay,
-    Opened,
-    reading,
-    store_finite,
-)
+from warmprior.data.index import DatasetIndex, DemonstrationReader, reading, store_finite
+from warmprior.envs.simulator import task_env_args
+from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
@@ -58,8 +58,8 @@ class LeRobotReader(DemonstrationReader):
         block = self._rows(self._episodes[demo], feature)[first : first + len(out), part]
         store_finite(block, out, self.name(demo, key), _REBUILD, first)
 
+    @override
     def terminated(self, demo: str) -> bool | None:
-        """Do as the base class describes."""
         if SUCCESS not in self.index.metadata.features:
             return None
         return bool(self._rows(self._episodes[demo], SUCCESS)[-1].any())
@@ -106,7 +106,7 @@ class LeRobotReader(DemonstrationReader):
         return f"{self.index.path / file}: {feature}{inside} of episode {demo}"
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first frames of an episode; see the base class."""
+        """Decode frames in parts."""
         episode, feature = self._episodes[demo], self.index.images[key]
         video = feature if feature in self.index.videos else None
         path = self.index.path / episode_file(self.index.metadata, episode, video)
@@ -140,62 +140,94 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
     return frames
 
 
-class LeRobotDemonstrations(DemonstrationReplay):
-    """The demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
+class LeRobotDemonstrations(Demonstrations):
+    """The demonstrations of a LeRobotDataset v3, ``"lerobot:folder"`` or ``"lerobot:user/name"`` on the hub.
 
-    It has the entries and properties of :class:`RobomimicDemonstrations`. Windows of
-    :class:`~warmprior.ActionWindow` equal those of ``delta_timestamps``, except before an episode's start:
-    LeRobot repeats the first action, which is part of the target; here the history is masked and zero.
+    Windows of :class:`~warmprior.ActionWindow` equal those of ``delta_timestamps``, except before the start
+    of an episode: LeRobot repeats the first action, which is part of the target; here the history is masked
+    and zero.
 
-    Only the images in ``image_keys`` of the selected episodes are fetched and decoded, once and by LeRobot's
-    own decoder. Without ``next.reward`` the rewards are ``next.success``, or zeros. Episodes whose
-    ``next.success`` is True at the end are terminated.
+    Only chosen images of the selected episodes are fetched and decoded, once and by LeRobot's own decoder.
+    ``"front_image"`` stands for the feature ``observation.images.front``, as pictures or a video. Without
+    ``next.reward`` the rewards are ``next.success``, or zeros. Episodes whose ``next.success`` is True at the
+    end are terminated. Observations are by default those of the task, or for an unknown environment
+    ``"observation.environment_state"`` and ``"observation.state"``, if present.
+
+    For a dataset that :func:`convert_robomimic` did not write, ``task`` names the environment: frequency,
+    widths and names are checked against it, and robomimic's observations are found with it. Without it, whole
+    features are observations. A mask is one of the converted file.
 
     Args:
         place: the dataset's folder, or its repository on the hub (``"user/name"``).
-        revision: branch, tag or commit of a repository.
-        env_args: description of the environment in which the dataset was recorded
-            (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
-            did not write; a converted one must name the same environment. Frequency, widths and names are
-            checked against it, and robomimic's observations are found with it. Without it, whole features
-            are observations.
+
+    Keyword Args:
         episodes: numbers of the episodes to read; all by default. Files of other episodes are not needed.
-        **kwargs: options of :class:`RobomimicDemonstrations`. ``observation_keys`` are by default those of
-            the task, or for an unknown environment ``"observation.environment_state"`` and
-            ``"observation.state"``, if present. Of ``image_keys``, ``"agentview_image"`` is the feature
-            ``observation.images.agentview``, as pictures or a video. ``filter_key`` is a mask of the
-            converted file.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if the dataset is invalid, or does not fit the environment; the message names the
-            folder or file, and the reason.
-        ValueError: see :class:`RobomimicDemonstrations`.
-        OSError: if a download fails, or there is no space for memory maps.
-
-    Examples:
-        >>> from warmprior.data import LeRobotDemonstrations
-        >>> data = LeRobotDemonstrations("square_lerobot", batch_size=256)  # doctest: +SKIP
-        >>> data.sample()["observation"].shape  # doctest: +SKIP
-        torch.Size([256, 23])
-        >>> LeRobotDemonstrations("square_lerobot")
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: square_lerobot: no meta/info.json there, so no LeRobotDataset; ...
+        revision: branch, tag or commit of a repository.
+        options: options of every format, see :func:`open_demonstrations`.
     """
+
+    prefix = "lerobot:"
 
     def __init__(
         self,
         place: str | Path,
         *,
-        revision: str | None = None,
-        env_args: Mapping[str, Any] | None = None,
         episodes: Sequence[int] | None = None,
-        **kwargs: Any,
+        revision: str | None = None,
+        **options: Any,
     ) -> None:
-        self._own: dict[str, Any] = {"revision": revision, "env_args": env_args, "episodes": episodes}
-        super().__init__(place, **kwargs)
+        super().__init__(place, **options)
+        self.episodes, self.revision = episodes, revision
 
-    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
-        index = read_lerobot_index(place, fetch=True, **self._own, **chosen)
-        return index, LeRobotReader(index)
+    @override
+    def check(self) -> None:
+        require("lerobot.datasets", "lerobot")
+        if not is_remote(self.place) and not Path(self.place).expanduser().is_dir():
+            raise FileNotFoundError(f"{self}: no such folder, and no repository user/name of the hub")
+
+    @override
+    def resolved(self) -> str:
+        remote = is_remote(self.place)
+        return str(self) if remote else f"{self.prefix}{Path(self.place).expanduser().resolve()}"
+
+    @override
+    def index(
+        self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
+    ) -> LeRobotIndex:
+        task = self.task
+        if isinstance(task, str):
+            task = task_env_args(task) if task in TASKS else None
+        return read_lerobot_index(
+            self.place,
+            revision=self.revision,
+            mask=self.mask,
+            observations=observations,
+            images=images,
+            poses=poses,
+            demos=self.demos,
+            episodes=self.episodes,
+            env_args=task,
+        )
+
+    def fetched(self, index: DatasetIndex) -> LeRobotIndex:
+        """Return an index of files that are on this machine."""
+        assert isinstance(index, LeRobotIndex)
+        if is_remote(self.place) and not all((index.path / file).is_file() for file in index.files):
+            folder = download_lerobot(str(self.place), index.files, revision=self.revision)
+            return replace(index, path=folder)
+        return index
+
+    @contextmanager
+    @override
+    def reader(self, index: DatasetIndex) -> Iterator[LeRobotReader]:
+        yield LeRobotReader(self.fetched(index))
+
+    def contents(self, index: DatasetIndex) -> str:
+        """Return the digest of the files of the selected episodes, numbers and images, alone."""
+        return self.fetched(index).digest()
+
+    @override
+    def origin(self, index: DatasetIndex) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+        assert isinstance(index, LeRobotIndex)
+        state = index.described.get("first_state")
+        return index.described.get("rendering"), None if state is None else np.array(state, np.float64)

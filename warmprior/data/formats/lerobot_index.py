@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, pairwise, product
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.replay import (
+from warmprior.data.index import (
     DatasetError,
     DatasetIndex,
     check_count,
     check_env_args,
     common_size,
     declared_poses,
+    no_such,
     pose_keys,
     reading,
-    unknown,
 )
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
@@ -65,7 +65,7 @@ def download_lerobot(
     return Path(folder)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LeRobotIndex(DatasetIndex):
     """The index of a LeRobotDataset, without its values.
 
@@ -230,10 +230,9 @@ def read_lerobot_index(
     dataset: str | Path,
     *,
     revision: str | None = None,
-    fetch: bool = False,
-    filter_key: str | None = None,
-    observation_keys: Sequence[str] | None = None,
-    image_keys: Sequence[str] = (),
+    mask: str | None = None,
+    observations: Sequence[str] | None = None,
+    images: Sequence[str] = (),
     poses: bool = False,
     demos: int | None = None,
     episodes: Sequence[int] | None = None,
@@ -241,9 +240,9 @@ def read_lerobot_index(
 ) -> LeRobotIndex:
     """Return the index of a LeRobotDataset v3 from its ``meta/``, without reading values.
 
-    From a dataset on the hub only ``meta/`` is fetched, or with ``fetch`` also the files to be read. Options
-    and errors are those of :class:`~warmprior.data.LeRobotDemonstrations`; ``poses`` also requires the hand
-    pose of every arm, from which absolute actions are built.
+    From a dataset on the hub only ``meta/`` is fetched. Options and errors are those of
+    :class:`LeRobotDemonstrations`; ``poses`` also requires the hand pose of every arm, from
+    which absolute actions are built.
     """
     remote = is_remote(dataset)
     root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()
@@ -260,21 +259,21 @@ def read_lerobot_index(
         if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint", "bool"))
     }
     if "action" not in widths:
-        raise unknown(root, "vector of numbers", "action", widths)
+        raise no_such(root, "vector of numbers", "action", widths)
     if recorded:
         _check_actions(root, metadata, recorded, task)
     named = _named_columns(root, metadata.features, widths, described, task)
     whole = {name: (name, slice(0, width)) for name, width in widths.items() if name != "action"}
     columns = named | whole
-    if observation_keys is None:
-        observation_keys = tuple(named)
+    if observations is None:
+        observations = tuple(named)
         if task is not None:
-            observation_keys = task.low_dim_keys
+            observations = task.low_dim_keys
         elif not described:
-            observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
-    for key in [*observation_keys, *(pose_keys(widths["action"]) if poses else ())]:
+            observations = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
+    for key in [*observations, *(pose_keys(widths["action"]) if poses else ())]:
         if key in metadata.camera_keys:
-            raise DatasetError(f"{root}: {key!r} is an image, not a vector: name it in image_keys")
+            raise DatasetError(f"{root}: {key!r} is an image, not a vector: name it in images")
         if key not in columns and (feature := metadata.features.get(key)):
             raise DatasetError(
                 f"{root}: {key!r} has dtype {feature['dtype']} and shape {list(feature['shape'])}, but "
@@ -282,44 +281,46 @@ def read_lerobot_index(
             )
         if key not in columns:
             options = [name for name in columns if name in named or name.startswith("observation")]
-            raise unknown(root, "observation", key, options)
+            raise no_such(root, "observation", key, options)
     cameras = camera_images(name for name in metadata.camera_keys if name not in metadata.depth_keys)
+    own = {feature: image for image, feature in cameras.items()}  # LeRobot's own names are known as well
+    images = [own.get(name, name) for name in images]
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     count = len(rows)
     if episodes is not None:
         rows = [rows[number] for number in _chosen(root, "episodes", episodes, count)]
-    if filter_key is not None:
+    if mask is not None:
         masks = described.get("masks", {})
-        if filter_key not in masks:
-            raise unknown(root, "filter key", filter_key, masks)
-        chosen = _chosen(root, f"the mask {filter_key!r}", masks[filter_key], count)
+        if mask not in masks:
+            raise no_such(root, "filter key", mask, masks)
+        chosen = _chosen(root, f"the mask {mask!r}", masks[mask], count)
         if not chosen:
-            raise DatasetError(f"{root}: the mask {filter_key!r} names no episode: choose another, or none")
+            raise DatasetError(f"{root}: the mask {mask!r} names no episode: choose another, or none")
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demos, len(rows))
-    rows = rows[:demos]
+    count, rows = len(rows), rows[:demos]
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),
         lengths=tuple(row["length"] for row in rows),
-        observation_keys=tuple(observation_keys),
-        observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observation_keys),
-        image_keys=tuple(image_keys),
-        image_size=_image_size(root, metadata.features, cameras, image_keys),
+        observation_keys=tuple(observations),
+        observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observations),
+        image_keys=tuple(images),
+        image_size=_image_size(root, metadata.features, cameras, images),
         available_keys=(*columns, *cameras),
         action_dim=widths["action"],
         env_args=recorded,
         task=task,
+        whole=len(rows) == count,
+        rate=metadata.fps,
         metadata=metadata,
         episodes=tuple(rows),
         columns=columns,
-        images={key: cameras[key] for key in image_keys},
+        images={key: cameras[key] for key in images},
         described=described,
     )
     parts = product(index.videos, ("chunk", "file"))
     _check_columns(root, metadata, [f"videos/{name}/{part}_index" for name, part in parts])
-    if fetch and remote and not all((root / file).is_file() for file in index.files):
-        index = replace(index, path=download_lerobot(str(dataset), index.files, revision=revision))
     return index
 
 
@@ -425,7 +426,7 @@ def _image_size(
     sizes = {}
     for key in keys:
         if key not in cameras:
-            raise unknown(root, "images", key, cameras)
+            raise no_such(root, "images", key, cameras)
         shape = tuple(features[cameras[key]]["shape"])
         side = max(shape)
         if shape not in ((side, side, 3), (3, side, side)):

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from warmprior.data.replay import (
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.index import (
     DatasetError,
     DatasetIndex,
     DemonstrationReader,
-    DemonstrationReplay,
-    Opened,
     check_count,
     common_size,
+    no_such,
     reading,
     store_finite,
-    unknown,
 )
 from warmprior.io.extras import require
+from warmprior.io.files import digest_of, file_digest
 
 _AGAIN = "Download it again."
 
@@ -33,7 +33,7 @@ SUCCESS_NAMES = ("success", "is_success")
 """The names of success in the ``info`` of Gymnasium's environments."""
 
 
-def load_minari(name: str) -> Any:
+def load_minari(name: str | Path) -> Any:
     """Return the dataset with a name such as ``"D4RL/door/human-v2"``, after downloading it if needed.
 
     Raises:
@@ -53,58 +53,6 @@ def load_minari(name: str) -> Any:
             f"minari:{name}: no such dataset at {folder} ({error}): `minari list remote` shows public "
             "datasets, and MINARI_DATASETS_PATH is the folder of local ones"
         ) from error
-
-
-def read_minari_index(
-    name: str,
-    *,
-    observation_keys: Sequence[str] | None = None,
-    image_keys: Sequence[str] = (),
-    demos: int | None = None,
-    filter_key: str | None = None,
-    poses: bool = False,
-) -> DatasetIndex:
-    """Return the index of a dataset; see :class:`MinariDemonstrations` for the arguments."""
-    dataset = load_minari(name)
-    where = Path(dataset.spec.data_path)
-    if filter_key is not None or poses:
-        what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
-        raise DatasetError(f"{where}: a Minari dataset has no {what}: leave the option out")
-    action = dataset.action_space
-    if getattr(action, "dtype", None) is None or action.dtype.kind != "f" or len(action.shape) != 1:
-        raise DatasetError(f"{where}: actions are {action}, but a flow needs one vector of real numbers")
-    spaces = dict(_spaces(dataset.observation_space))
-    vectors = {key: math.prod(space.shape) for key, space in spaces.items() if _is_vector(space)}
-    if not vectors:
-        raise DatasetError(
-            f"{where}: observations are {dataset.observation_space}, but a policy needs a vector, or a "
-            "dictionary with one: record them with gymnasium.wrappers.FlattenObservation"
-        )
-    pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
-    chosen = tuple(vectors if observation_keys is None else observation_keys)
-    for kind, wanted, present in (("observation", chosen, vectors), ("image", image_keys, pictures)):
-        for key in wanted:
-            if key not in present:
-                raise unknown(where, kind, key, present)
-    check_count(where, demos, dataset.total_episodes)
-    episodes = [int(i) for i in dataset.episode_indices][:demos]
-    with reading(f"{where}: its episodes", _AGAIN):
-        steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
-    if not steps or min(steps) < 1:
-        raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
-    return DatasetIndex(
-        path=where,
-        demos=tuple(map(str, episodes)),
-        lengths=tuple(steps),
-        observation_keys=chosen,
-        observation_dims=tuple(vectors[key] for key in chosen),
-        image_keys=tuple(image_keys),
-        image_size=common_size(where, {pictures[key][0]: key for key in image_keys}),
-        available_keys=(*vectors, *pictures),
-        action_dim=action.shape[0],
-        env_args={},
-        task=None,
-    )
 
 
 def _spaces(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -129,7 +77,7 @@ def _is_picture(space: Any) -> bool:
 class MinariReader(DemonstrationReader):
     """A reader of a dataset's values."""
 
-    def __init__(self, name: str, path: Path) -> None:
+    def __init__(self, name: str | Path, path: Path) -> None:
         self._dataset, self._path = load_minari(name), path
         self._episode = lru_cache(maxsize=1)(self._read)  # arrays of one episode are read one after another
 
@@ -147,8 +95,8 @@ class MinariReader(DemonstrationReader):
                 observations = observations[part]
         return np.asarray(observations)[:-1]  # the last one follows the last action
 
+    @override
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Do as the base class describes."""
         values = self._values(demo, key)
         block = values.reshape(len(values), -1)[first : first + len(out)]
         if block.shape != out.shape:
@@ -157,68 +105,107 @@ class MinariReader(DemonstrationReader):
             )
         store_finite(block, out, self.name(demo, key), "Delete the episode, or download it again.", first)
 
+    @override
     def terminated(self, demo: str) -> bool | None:
-        """Do as the base class describes."""
         return bool(self._values(demo, "terminations")[-1])
 
+    @override
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Do as the base class describes."""
         frames = torch.from_numpy(self._values(demo, f"obs/{key}")[: len(out)])
         out.copy_(frames.permute(0, 3, 1, 2))
 
+    @override
     def name(self, demo: str, key: str) -> str:
-        """Do as the base class describes."""
         return f"{self._path}: {key.removeprefix('obs/')} of episode {demo}"
 
 
-class MinariDemonstrations(DemonstrationReplay):
-    """The demonstrations of a Minari dataset, as one immutable TorchRL replay buffer.
+class MinariDemonstrations(Demonstrations):
+    """The demonstrations of a Minari dataset, such as ``"minari:D4RL/door/human-v2"``.
 
-    It has the entries and properties of :class:`RobomimicDemonstrations`. An observation that follows the
-    last action of an episode is left out.
-
-    Args:
-        place: name of the dataset, such as ``"D4RL/door/human-v2"``. A dataset that is not in Minari's folder
-            (``MINARI_DATASETS_PATH``) is downloaded.
-        observation_keys: observations to concatenate: names in a dictionary space, ``"outer/inner"`` in
-            nested ones; all vectors by default.
-        image_keys: images to read as well; they must be square.
-        demos: number of demonstrations to take, from the first on; all by default.
-        filter_key: must be ``None``, because there are no masks.
-        absolute_actions: must be ``False``, because there are no poses.
-        **kwargs: these and the others as for :class:`RobomimicDemonstrations`.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if the dataset is damaged, or its actions are not vectors of real numbers.
-
-    Examples:
-        >>> from warmprior.data import MinariDemonstrations
-        >>> data = MinariDemonstrations("D4RL/door/human-v2", batch_size=256)  # doctest: +SKIP
-        >>> data.sample()["observation"].shape  # doctest: +SKIP
-        torch.Size([256, 39])
+    A dataset that is not in Minari's folder (``MINARI_DATASETS_PATH``) is downloaded. Observations are by
+    default all vectors; entries of dictionaries have the names ``"outer/inner"``. An observation that follows
+    the last action of an episode is left out. Images must be square.
     """
 
-    def _opened(self, stack: ExitStack, place: Any, **chosen: Any) -> Opened:
-        index = read_minari_index(place, **chosen)
-        return index, MinariReader(place, index.path)
+    prefix = "minari:"
 
+    @property
+    @override
+    def title(self) -> str:
+        return str(self.place).replace("/", "-")
 
-def minari_environment(name: str) -> dict[str, Any] | None:
-    """Return a dataset's description of its environment, for :func:`warmprior.envs.registered_env`.
+    @override
+    def check(self) -> None:
+        require("minari", "minari")
 
-    The result is ``None`` without a description. Its ``"success"`` is the steps' name of success, if any.
-    """
-    dataset = load_minari(name)
-    spec = dataset.env_spec
-    if spec is None:
-        return None
-    with reading(f"{dataset.spec.data_path}: the first episode", _AGAIN):
-        infos = next(dataset.iterate_episodes()).infos or {}
-    return {
-        "id": spec.id,
-        "kwargs": dict(spec.kwargs or {}),
-        "wrappers": [wrapper.name for wrapper in spec.additional_wrappers or ()],
-        "max_episode_steps": spec.max_episode_steps,
-        "success": next((key for key in SUCCESS_NAMES if key in infos), None),
-    }
+    @override
+    def index(
+        self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
+    ) -> DatasetIndex:
+        dataset = load_minari(self.place)
+        where = Path(dataset.spec.data_path)
+        if self.mask is not None or poses:
+            what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
+            raise DatasetError(f"{where}: a Minari dataset has no {what}: leave the option out")
+        action = dataset.action_space
+        if getattr(action, "dtype", None) is None or action.dtype.kind != "f" or len(action.shape) != 1:
+            raise DatasetError(f"{where}: actions are {action}, but a flow needs one vector of real numbers")
+        spaces = dict(_spaces(dataset.observation_space))
+        vectors = {key: math.prod(space.shape) for key, space in spaces.items() if _is_vector(space)}
+        if not vectors:
+            raise DatasetError(
+                f"{where}: observations are {dataset.observation_space}, but a policy needs a vector, or a "
+                "dictionary with one: record them with gymnasium.wrappers.FlattenObservation"
+            )
+        pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
+        chosen = tuple(vectors if observations is None else observations)
+        for kind, wanted, present in (("observation", chosen, vectors), ("image", images, pictures)):
+            for key in wanted:
+                if key not in present:
+                    raise no_such(where, kind, key, present)
+        check_count(where, self.demos, dataset.total_episodes)
+        episodes = [int(i) for i in dataset.episode_indices][: self.demos]
+        with reading(f"{where}: its episodes", _AGAIN):
+            steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
+        if not steps or min(steps) < 1:
+            raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
+        return DatasetIndex(
+            path=where,
+            demos=tuple(map(str, episodes)),
+            lengths=tuple(steps),
+            observation_keys=chosen,
+            observation_dims=tuple(vectors[key] for key in chosen),
+            image_keys=tuple(images),
+            image_size=common_size(where, {pictures[key][0]: key for key in images}),
+            available_keys=(*vectors, *pictures),
+            action_dim=action.shape[0],
+            env_args={},
+            task=None,
+            whole=self.demos in (None, dataset.total_episodes),
+        )
+
+    @contextmanager
+    @override
+    def reader(self, index: DatasetIndex) -> Iterator[MinariReader]:
+        yield MinariReader(self.place, index.path)
+
+    @override
+    def contents(self, index: DatasetIndex) -> str:
+        return digest_of(*map(file_digest, sorted(path for path in index.path.rglob("*") if path.is_file())))
+
+    def environment(self, index: DatasetIndex) -> dict[str, Any]:
+        """Return also the steps' name of success, if they have one."""
+        dataset = load_minari(self.place)
+        spec = dataset.env_spec
+        if spec is None:
+            return {}
+        with reading(f"{dataset.spec.data_path}: the first episode", _AGAIN):
+            infos = next(dataset.iterate_episodes()).infos or {}
+        described = {
+            "id": spec.id,
+            "kwargs": dict(spec.kwargs or {}),
+            "wrappers": [wrapper.name for wrapper in spec.additional_wrappers or ()],
+            "max_episode_steps": spec.max_episode_steps,
+            "success": next((key for key in SUCCESS_NAMES if key in infos), None),
+        }
+        return {"gymnasium": described}

@@ -1,0 +1,193 @@
+"""The index of demonstrations in any format, and what their readers share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warmprior.checks import check_choice, check_distinct, check_whole_numbers
+from warmprior.envs.env_args import declared_actions
+from warmprior.envs.tasks import TaskSpec
+
+BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
+MISFIT = "They do not fit these actions: correct one or the other."
+LARGEST = 1e9  # in any unit; a larger value is damage, and would squash all others of its feature
+
+
+class DatasetError(ValueError):
+    """An invalid demonstration file; the message says where it is wrong and what to do.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.data import open_demonstrations
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "square.hdf5"
+        ...     _ = path.write_bytes(b"a download that broke off")
+        ...     open_demonstrations(path).steps()
+        Traceback (most recent call last):
+            ...
+        warmprior.data.index.DatasetError: ...square.hdf5: not a readable HDF5 file (25 bytes; ...
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetIndex:
+    """The index of demonstrations, without their values.
+
+    Attributes:
+        path: the file or folder.
+        demos: names of the selected demos, in the order of their numbers.
+        observation_keys: the observations to read, in the order of concatenation.
+        image_size: side of the images to read in pixels; 0 if there are none.
+        available_keys: all observations.
+        env_args: the description of the environment; empty if it is unknown.
+        task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
+        whole: False if only the first of the demonstrations were asked for.
+        rate: control steps per second, if they are known.
+    """
+
+    path: Path
+    demos: tuple[str, ...]
+    lengths: tuple[int, ...]
+    observation_keys: tuple[str, ...]
+    observation_dims: tuple[int, ...]
+    image_keys: tuple[str, ...]
+    image_size: int
+    available_keys: tuple[str, ...]
+    action_dim: int
+    env_args: dict[str, Any]
+    task: TaskSpec | None
+    whole: bool = True
+    rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.demos:
+            raise DatasetError(f"{self.path}: no demonstrations are chosen; the mask names none")
+        if not self.observation_keys:
+            listed = ", ".join(self.available_keys)
+            raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
+        check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that have images."""
+        ending = "_image"
+        return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
+
+    @property
+    def task_name(self) -> str:
+        """The short name of the task, or its environment's name if no task of robosuite has it."""
+        return str(self.env_args["env_name"]).lower() if self.task is None else self.task.name
+
+    @property
+    def pose_columns(self) -> Tensor:
+        """The columns of ``"observation"`` with grippers' positions and quaternions, int64 ``[arms, 7]``."""
+        first = dict(zip(self.observation_keys, np.cumsum([0, *self.observation_dims]), strict=False))
+        columns: list[list[int]] = []
+        while not columns or f"robot{len(columns)}_eef_pos" in first:
+            position, quaternion = (first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat"))
+            columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
+        return torch.tensor(columns)
+
+    def joint_columns(self, key: str) -> list[int]:
+        """Return for each action the column of ``"observation"``, within ``key``, that it sets, or -1."""
+        check_choice("joints", key, self.observation_keys)
+        position = self.observation_keys.index(key)
+        first, width = sum(self.observation_dims[:position]), self.observation_dims[position]
+        return [first + action if action < width else -1 for action in range(self.action_dim)]
+
+
+class DemonstrationReader(ABC):
+    """A reader of demonstrations' values, given their :class:`DatasetIndex`."""
+
+    @abstractmethod
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read and check rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"``, from ``first`` on.
+
+        Rewards that are not recorded are zeros.
+        """
+
+    def terminated(self, demo: str) -> bool | None:
+        """Return whether a demo ended by itself, as recorded; None if only its rewards tell."""
+        return None
+
+    @abstractmethod
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
+
+    @abstractmethod
+    def name(self, demo: str, key: str) -> str:
+        """Return the name of a demo's array for errors, with the file that holds it."""
+
+
+def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
+    """Raise DatasetError unless there are robomimic's text ``env_name`` and dict ``env_kwargs``."""
+    for key, kind in (("env_name", str), ("env_kwargs", dict)):
+        if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
+            raise DatasetError(
+                f"{what} lacks {key}, or it is not a {kind.__name__}: write it, or remove the description to "
+                "train without an environment"
+            )
+    return env_args
+
+
+def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Call :func:`~warmprior.envs.env_args.declared_actions`; raise DatasetError if it fails."""
+    with reading(f"{path}: env_args", MISFIT):
+        return declared_actions(env_args)
+
+
+@contextmanager
+def reading(what: str, advice: str) -> Iterator[None]:
+    """Turn any error inside into a DatasetError that says what cannot be read, with advice."""
+    try:
+        yield
+    except (DatasetError, MemoryError):
+        raise
+    except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
+        raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
+
+
+def check_count(path: Path, demos: int | None, available: int) -> None:
+    """Raise an error for no demonstrations, or for more than there are."""
+    if demos is not None:
+        check_whole_numbers(demos=demos)
+        if demos > available:
+            raise DatasetError(f"{path}: there are {available} demonstrations, fewer than demos={demos}")
+
+
+def no_such(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetError:
+    """Return the error for a name that is not among those of its kind."""
+    return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(names) or 'none'}")
+
+
+def common_size(path: Path, sides: Mapping[int, str]) -> int:
+    """Return the common side of all images in pixels, 0 without images; raise DatasetError if they differ."""
+    if len(sides) > 1:
+        raise DatasetError(f"{path}: images must have one size, got {sides}: render them again")
+    return next(iter(sides), 0)
+
+
+def pose_keys(action_dim: int) -> list[str]:
+    """Return the observations of the hands' poses, for as many arms as the pose deltas have."""
+    arms = range(min(action_dim // 7, 2))
+    return [f"robot{arm}_eef_{part}" for arm in arms for part in ("pos", "quat")]
+
+
+def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, first: int = 0) -> None:
+    """Copy numbers to ``out``; raise DatasetError if one is not finite there, or above 1e9."""
+    with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
+        out[...] = block.reshape(out.shape)
+    usable = np.abs(out) <= LARGEST  # False for NaN
+    if not usable.all():
+        value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
+        raise DatasetError(f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g}. {advice}")

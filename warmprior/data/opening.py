@@ -1,0 +1,60 @@
+"""The formats of demonstrations, by what their places begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.minari import MinariDemonstrations
+
+FORMATS: tuple[type[Demonstrations], ...] = (
+    LeRobotDemonstrations,
+    MinariDemonstrations,
+    RobomimicDemonstrations,
+)
+"""The formats; the first whose prefix a place has reads it."""
+
+
+def open_demonstrations(
+    place: str | Path,
+    *,
+    demos: int | None = None,
+    mask: str | None = None,
+    style: str | None = None,
+    task: str | Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Demonstrations:
+    """Return the demonstrations at a place, raw as recorded; values are only read by their ``steps``.
+
+    Args:
+        place: a robomimic or MimicGen HDF5 file; ``lerobot:`` and the folder or repository of a
+            LeRobotDataset v3; or ``minari:`` and the name of a Minari dataset.
+
+    Keyword Args:
+        demos: number of demonstrations to take, from the first on; all by default.
+        mask: a mask of the place, such as ``"train"``; all demonstrations by default.
+        style: style of the recording, which decides robosuite's time limit: ``"ph"`` by default, and
+            ``"human"`` outside robosuite.
+        task: the task of robosuite, or its ``env_args``, for a LeRobotDataset that does not describe its
+            environment.
+        options: options of the format: of a LeRobotDataset ``episodes``, the numbers of the episodes to read
+            (files of others are not needed), and ``revision``, a branch, tag or commit of a repository.
+
+    Examples:
+        >>> from warmprior.data import open_demonstrations
+        >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
+        'lerobot:square'
+        >>> open_demonstrations("square.hdf5", mask="train").steps()["observation"].shape  # doctest: +SKIP
+        torch.Size([30154, 23])
+        >>> open_demonstrations("nowhere.hdf5").steps()
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
+    """
+    kind = next(kind for kind in FORMATS if str(place).startswith(kind.prefix))
+    place = str(place).removeprefix(kind.prefix)
+    return kind(place, demos=demos, mask=mask, style=style, task=task, **options)
