@@ -25,11 +25,11 @@ def main(argv: list[str] | None) -> None:
     parser.add_argument(
         "--repository", default="user/name", help="hub repository that the card names (default: %(default)s)"
     )
-    parser.add_argument("--licence", help="licence of the policy in the hub's spelling, such as mit")
+    parser.add_argument("--license", help="licence of the policy in the hub's spelling, such as mit")
     args = parser.parse_args(argv)
     results = measured(policy_results(args.run, args.folder))
     actor = load_policy(args.folder)
-    print(model_card(actor, **results, repository=args.repository, licence=args.licence))
+    print(model_card(actor, **results, repository=args.repository, license=args.license))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The paper's H = 1 study (Fig. 6), extended to more chunk lengths: success, and jumps at chunk boundaries.
 
 python benchmarks/chunking.py                             # square ph, one seed, over an hour on two cores
-python benchmarks/chunking.py --chunk 1 8 --nfe 1 --task square transport --data ph mh    # the paper's figure
+python benchmarks/chunking.py --chunk 1 8 --nfe 1 --task square transport --style ph mh   # the paper's figure
 python benchmarks/chunking.py --resume                    # after an interruption
 
 Policies that robomimic.py trained with the same options are reused.

@@ -1,7 +1,7 @@
 """Curvature of the flow (the paper's Table 2 and Fig. 4): how straight each source makes it.
 
 python benchmarks/curvature.py --run runs/can-ph-quick     # the policies of a finished run
-python benchmarks/curvature.py --data mh --preset cpu         # policies of these options, trained first
+python benchmarks/curvature.py --style mh --preset cpu         # policies of these options, trained first
 """
 
 from __future__ import annotations

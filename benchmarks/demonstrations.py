@@ -27,14 +27,14 @@ def main(argv: list[str] | None) -> None:
 
     add = commands.add_parser("generate", help="generate scripted demonstrations").add_argument
     add("task", choices=list(EXPERTS))
-    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (default: %(default)s)")
+    add("--style", default="ph", choices=("ph", "mh"), help="one or six operators (default: %(default)s)")
     add("--n", type=int, default=200, help="number of demonstrations (default: %(default)s)")
     add("--out", type=Path, help="HDF5 file to write (default: in the cache)")
     add("--overwrite", action="store_true", help="replace an existing file")
 
     add = commands.add_parser("download", help="download the official file of a task").add_argument
     add("task", choices=list(OFFICIAL))
-    add("data", nargs="?", help="style, such as ph or mh (default: the first that is published)")
+    add("style", nargs="?", help="style, such as ph or mh (default: the first that is published)")
     add("--force", action="store_true", help="download again, even if the file is in the cache")
 
     add = commands.add_parser(
@@ -49,9 +49,9 @@ def main(argv: list[str] | None) -> None:
 
     args = parser.parse_args(argv)
     if args.command == "generate":
-        print(generate_demonstrations(args.task, args.data, args.n, path=args.out, overwrite=args.overwrite))
+        print(generate_demonstrations(args.task, args.style, args.n, path=args.out, overwrite=args.overwrite))
     elif args.command == "download":
-        print(download_robomimic(args.task, args.data, force=args.force))
+        print(download_robomimic(args.task, args.style, force=args.force))
     else:
         rendering = {"fast": args.fast, "out": args.out, "workers": args.workers}
         print(render_demonstrations(args.file, args.cameras, args.size, **rendering))

@@ -1,7 +1,7 @@
 """Absolute joint targets, which most arms record: the scripted square, played by a joint controller.
 
 python benchmarks/joint_targets.py --preset cpu --prior gaussian past preview past,correlation=0.5 --nfe 9 3 1
-python benchmarks/joint_targets.py --data mh --demonstrations 300
+python benchmarks/joint_targets.py --style mh --demonstrations 300
 
 A second arm follows each scripted demonstration, as a follower arm follows its leader: its targets are the
 joint positions of the next step, tracked by robosuite's JOINT_POSITION controller. The second arm's motion is
@@ -108,16 +108,16 @@ def demonstrations(style: str, count: int) -> Path:
 
 def task(options: DataOptions) -> Task:
     """Return the task: the follower's demonstrations, and square under the same controller."""
-    options.check_only("task", "data", "demonstrations", "time_limit")
-    style = options.data[0]
+    options.check_only("task", "style", "demonstrations", "horizon")
+    style = options.style[0]
     if style not in ("ph", "mh"):
-        raise ValueError(f"--data {style} has no scripted demonstrations: choose ph or mh")
+        raise ValueError(f"--style {style} has no scripted demonstrations: choose ph or mh")
     path = demonstrations(style, options.count(style))
     return Task(
         open_demonstrations(path, style=style),
         observations=OBSERVATION,
         joints=f"{ARM}joint_pos",
-        play=Play(horizon=options.time_limit),
+        play=Play(horizon=options.horizon),
     )
 
 

@@ -2,7 +2,7 @@
 
 python benchmarks/mimicgen_tasks.py                              # robosuite's Stack, scripted, from state
 python benchmarks/mimicgen_tasks.py --download --preset paper --device cuda --out runs/mimicgen
-python benchmarks/mimicgen_tasks.py --download --task coffee_d0 --data core --demonstrations 10
+python benchmarks/mimicgen_tasks.py --download --task coffee_d0 --style core --demonstrations 10
 python benchmarks/mimicgen_tasks.py --resume --out runs/mimicgen # after an interruption
 
 With --download or --dataset the tasks are MimicGen's own, stack_d0, coffee_d0 and threading_d0, and need its
@@ -42,7 +42,7 @@ def adapt(preset: Options, typed: Options) -> Options:
     if typed.data.generated:
         return chosen
     tasks = () if typed.data.dataset else ("stack_d0", "coffee_d0", "threading_d0")
-    return with_parts(chosen, data={"task": tasks, "data": ("source",)})
+    return with_parts(chosen, data={"task": tasks, "style": ("source",)})
 
 
 @script("mimicgen_tasks.py", together=True)

@@ -38,6 +38,7 @@ from lab.report import labelled, setting_title, table, write_report
 from lab.rows import AGENT, read_rows
 from lab.tasks import DataOptions
 from warmprior import WarmPriorActor
+from warmprior.checks import given
 from warmprior.io.files import read_json
 from warmprior.io.workers import torch_threads
 from warmprior.rl import PriorSpaceTraining
@@ -107,12 +108,12 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
 # Changes of a preset for a task.
 BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
     # Weak policies, which solve 30 to 80% of the episodes.
-    ("quick", "lift"): {"data": {"demonstrations": (5,)}, "training": {"iterations": 300}, "horizon": 90},
+    ("quick", "lift"): {"data": {"demonstrations": (5,), "horizon": 90}, "training": {"iterations": 300}},
     ("quick", "can"): {"training": {"iterations": 500}},
-    ("paper", "lift"): {"rl": {"updates": 30}, "horizon": 300},
-    ("paper", "can"): {"horizon": 300},
-    ("paper", "square"): {"rl": {"gamma": 0.999, "warmup_steps": 32_000}, "horizon": 400},
-    ("paper", "transport"): {"rl": {"hidden_dim": 128, "warmup_steps": 640_000}, "horizon": 800},
+    ("paper", "lift"): {"rl": {"updates": 30}, "data": {"horizon": 300}},
+    ("paper", "can"): {"data": {"horizon": 300}},
+    ("paper", "square"): {"rl": {"gamma": 0.999, "warmup_steps": 32_000}, "data": {"horizon": 400}},
+    ("paper", "transport"): {"rl": {"hidden_dim": 128, "warmup_steps": 640_000}, "data": {"horizon": 800}},
 }
 
 
@@ -136,8 +137,7 @@ def learn(
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
-    limit = {} if options.horizon is None else {"horizon": options.horizon}
-    parts = limit | options.evaluation.environment
+    parts = given(horizon=options.data.horizon) | options.evaluation.environment
     rounds = None
     if options.collectors is not None:
         from lab.ray_collection import ray_rounds

@@ -1,7 +1,7 @@
 """The paper's Table 1: Gaussian source, WP-Past and WP-Preview on robomimic's tasks.
 
 python benchmarks/robomimic.py                                   # a first table within minutes
-python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
+python benchmarks/robomimic.py --task can stack --style ph mh --preset cpu
 python benchmarks/robomimic.py --obs image                       # lift from two cameras
 python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper
 torchrun --nproc-per-node 2 benchmarks/robomimic.py --preset paper --device cuda    # on two GPUs

@@ -1,7 +1,7 @@
 """The paper's sigma ablation: success, curvature and the branching bound against the residual noise.
 
 python benchmarks/sigma.py                                # square ph, one seed, under an hour on two cores
-python benchmarks/sigma.py --data mh --preset cpu         # the paper's task, three seeds
+python benchmarks/sigma.py --style mh --preset cpu         # the paper's task, three seeds
 python benchmarks/sigma.py --resume                       # after an interruption
 
 Policies that robomimic.py trained with the same options are reused.

@@ -111,7 +111,7 @@ def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, mon
         assert main(["push", str(folder), "me/lift"]) == 2
         assert "401" in capsys.readouterr().err and not hub.repositories
         monkeypatch.setenv("HF_TOKEN", TOKEN)
-        assert main(["push", str(folder), "me/lift", "--private", "--licence", "mit"]) == 0
+        assert main(["push", str(folder), "me/lift", "--private", "--license", "mit"]) == 0
         assert hub.repositories["me/lift"].branches["main"] in capsys.readouterr().out
         assert b"license: mit" in hub.files("me/lift")["README.md"]
         assert hub.repositories["me/lift"].private

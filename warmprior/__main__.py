@@ -87,7 +87,7 @@ def push(
     *,
     card: Path | None = None,
     private: bool = False,
-    licence: str | None = None,
+    license: str | None = None,
     dry_run: bool = False,
     revision: str | None = None,
     modules: Imported = (),
@@ -99,7 +99,7 @@ def push(
         repository: user/name of the repository, created if needed
         card: file with the model card, as benchmarks/card.py writes it; by default generated
         private: make the repository private if it is created
-        licence: licence of the policy in the hub's spelling, such as mit
+        license: licence of the policy in the hub's spelling, such as mit
         dry_run: print the card and upload nothing
         revision: branch of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
@@ -108,7 +108,7 @@ def push(
     if not Path(folder).is_dir():
         raise FileNotFoundError(f"no policy at {folder}: there is no such folder")
     actor = _policy(folder, None, modules)  # the revision is the repository's, not the folder's
-    text = card.read_text() if card else model_card(actor, repository=repository, licence=licence)
+    text = card.read_text() if card else model_card(actor, repository=repository, license=license)
     if dry_run:
         print(text)
         return

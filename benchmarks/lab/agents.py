@@ -86,7 +86,6 @@ class AgentsOptions(Options):
     # for warm sources, centre of the search: the source's mean, zero as a control, or both
     centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
     delta: tuple[float, ...] = ()  # half widths of the agents' boxes (default: 0.5 around a mean, else 1.5)
-    horizon: int | None = None  # control steps per episode (default: the task's)
     num_envs: int = 4  # number of parallel environments per agent
     # number of Ray actors that collect, with --num-envs environments each; needs --engine ray (default: none)
     collectors: int | None = None
@@ -100,16 +99,16 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
-        check_counts(self, "horizon", "num_envs", "collectors")
+        check_counts(self, "num_envs", "collectors")
         if self.collectors is not None and self.collectors > 10:  # more would share seeds with other runs
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
-        check_single(self, "task", "data", "chunk", "sigma", "nfe")
+        check_single(self, "task", "style", "chunk", "sigma", "nfe")
         check_given(self, "algorithm", "centre")
         if self.evaluation.temperature != (1.0,):
             raise ValueError("agents choose the noise themselves: leave out --temperature")
-        if self.is_toy and (self.horizon is not None or self.evaluation.play_on):
+        if self.is_toy and (self.data.horizon is not None or self.evaluation.play_on):
             raise ValueError("episodes of the toy have one length: leave out --horizon and --play-on")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")

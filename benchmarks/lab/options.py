@@ -161,7 +161,7 @@ class Options:
         space = [] if self.data.actions == "delta" else [self.data.actions]
         observations = [] if self.data.obs == "state" else [self.data.obs]
         names = [task.replace(":", "-") for task in tasks]
-        return "-".join([*names, *self.data.data, *space, *observations])
+        return "-".join([*names, *self.data.style, *space, *observations])
 
     @property
     def seeds(self) -> range:
@@ -225,7 +225,7 @@ class MeasuredOptions(Options):
 
     def check(self) -> None:
         super().check()
-        check_single(self, "task", "data", "chunk")
+        check_single(self, "task", "style", "chunk")
         check_counts(self, "observations")
         if self.validation is not None:
             check_place(self.validation, "--validation")

@@ -375,7 +375,7 @@ def success_report(
 
 
 # Options that are not part of the recipe, or are in the first lines of a report.
-NO_RECIPE = {"task", "data", "dataset", "download", "force_download", "demonstrations"}
+NO_RECIPE = {"task", "style", "dataset", "download", "force_download", "demonstrations"}
 NO_RECIPE |= {"seed", "seeds", "episodes", "nfe", "save_every", "log_every"}
 
 

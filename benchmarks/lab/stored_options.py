@@ -58,8 +58,10 @@ def of_run(options: Options, run: Path) -> Options:
         ValueError: if one of them differs.
     """
     stored = stored_options(Options, run, None)
-    some: dict[str, dict[str, Any]] = {"data": {}, "sources": {"prior": options.sources.prior}}
-    for part, name in (("data", "task"), ("data", "data"), ("sources", "chunk")):
+    # Policies do not depend on how long they are played.
+    some: dict[str, dict[str, Any]] = {"data": {"horizon": options.data.horizon}}
+    some["sources"] = {"prior": options.sources.prior}
+    for part, name in (("data", "task"), ("data", "style"), ("sources", "chunk")):
         typed = getattr(getattr(options, part), name)
         if {*typed} <= {*getattr(getattr(stored, part), name)}:
             some[part][name] = typed

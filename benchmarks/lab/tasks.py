@@ -91,45 +91,46 @@ class DataOptions:
     Attributes:
         task: tasks of robosuite (default: can in the quick preset, otherwise square, or the dataset's), or
             package.module:function of your own, which takes these options and returns a Task
-        data: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
+        style: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
             source (human) or core (generated from source)
         dataset: demonstrations in place of generated ones: a robomimic HDF5 file, lerobot:FOLDER or
             lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
         download: download the official demonstrations, in place of generated ones
         force_download: download the official demonstrations again, in place of a broken local copy
         mask: mask of the file, such as train, whose demonstrations to use (default: all)
-        time_limit: control steps per episode (default: the environment's own, or robosuite's for the style)
+        horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
         demonstrations: number of demonstrations to generate, or to take from a file (default: all of it); two
             numbers for ph and mh
         actions: actions of the policies: deltas as recorded, or the absolute poses that they target
         obs: observations of the policies: state of robot and objects, or state of the robot and images
-        cameras: cameras of the images (default: the task's two, or four with two arms)
+        images: images, such as agentview_image (default: those of the task's two cameras, or four with two
+            arms)
         image_size: side of the images in pixels
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster
 
     Examples:
         >>> from lab.tasks import DataOptions
-        >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
+        >>> options = DataOptions(style=("ph", "mh"), demonstrations=(20, 60))
         >>> options.count("ph"), options.count("mh"), options.generated
         (20, 60, True)
     """
 
     task: tuple[str, ...] = ()
-    data: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
+    style: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
     dataset: Path | None = None
     download: bool = False
     force_download: bool = False
     mask: str | None = None
-    time_limit: int | None = None
+    horizon: int | None = None
     demonstrations: tuple[int, ...] = ()
     actions: Actions = "delta"
     obs: Literal["state", "image"] = "state"
-    cameras: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()
     image_size: int = 84
     fast_rendering: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, "demonstrations", "image_size", "time_limit")
+        check_counts(self, "demonstrations", "image_size", "horizon")
         if len(self.demonstrations) > 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got {self.demonstrations}"
@@ -154,22 +155,24 @@ class DataOptions:
                 raise ValueError(f"--obs image needs the simulator's images: {error}") from error
             if self.actions == "absolute":
                 raise ValueError("--obs image goes with --actions delta, as in the paper")
-            if len(set(self.cameras)) < len(self.cameras):
-                raise ValueError(f"--cameras names one twice: {' '.join(self.cameras)}")
-        elif self.cameras or self.fast_rendering:
-            raise ValueError("--cameras and --fast-rendering belong to --obs image")
+            if len(set(self.images)) < len(self.images):
+                raise ValueError(f"--images names one twice: {' '.join(self.images)}")
+        elif self.images or self.fast_rendering:
+            raise ValueError("--images and --fast-rendering belong to --obs image")
         if self.dataset is not None:
             if self.download:
                 raise ValueError("--dataset reads a file: leave out --download")
-            if len(self.task) > 1 or len(self.data) > 1:
-                raise ValueError("--dataset is of one task and style: name at most one --task and --data")
+            if len(self.task) > 1 or len(self.style) > 1:
+                raise ValueError("--dataset is of one task and style: name at most one --task and --style")
             if len(self.demonstrations) > 1:
                 raise ValueError(
                     f"--demonstrations takes one number with --dataset, got {self.demonstrations}"
                 )
             check_place(self.dataset, "--dataset")
-        if len(self.data) > 1 and self.task and not any(map(is_simulated, self.task)):
-            raise ValueError(f"a task of your own has one style: name one --data, got {' '.join(self.data)}")
+        if len(self.style) > 1 and self.task and not any(map(is_simulated, self.task)):
+            raise ValueError(
+                f"a task of your own has one style: name one --style, got {' '.join(self.style)}"
+            )
         for task in filter(is_simulated, self.task):
             get_task(task)
             if self.generated and task not in EXPERTS:
@@ -179,10 +182,10 @@ class DataOptions:
                 )
             if self.download and is_mimicgen(get_task(task).env_name):
                 find_mimicgen()
-        for style in self.data if self.generated else ():
+        for style in self.style if self.generated else ():
             if style not in ("ph", "mh"):
                 raise ValueError(
-                    f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
+                    f"--style {style} is that of MimicGen's files: add --download, or --dataset FILE"
                 )
 
     def check_only(self, *names: str) -> None:
@@ -192,7 +195,7 @@ class DataOptions:
         if others:
             words = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(others))
             raise ValueError(f"this task has demonstrations of its own: leave out {words}")
-        if "data" not in names and len(self.demonstrations) > 1:
+        if "style" not in names and len(self.demonstrations) > 1:
             raise ValueError(f"this task takes one number of --demonstrations, got {self.demonstrations}")
 
     @property
@@ -241,16 +244,15 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         style=style,
         task=next(iter(options.task), None) if source == "file" else None,
     )
-    images: list[str] = []
+    images: Sequence[str] = ()
     pictured = demonstrations
     if options.obs == "image":
         index = demonstrations.index()
-        cameras = options.cameras or (index.task.cameras if index.task else index.cameras)
-        if not cameras:
-            raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
-        images = [f"{camera}_image" for camera in cameras]
-        pictured = with_images(demonstrations, cameras, options.image_size, options.fast_rendering)
-    play = Play(horizon=options.time_limit, fast_rendering=options.fast_rendering)
+        images = options.images or images_of(index.task.cameras if index.task else index.cameras)
+        if not images:
+            raise ValueError(f"{path} has no images, and its task is unknown: name --images")
+        pictured = with_images(demonstrations, images, options.image_size, options.fast_rendering)
+    play = Play(horizon=options.horizon, fast_rendering=options.fast_rendering)
     task = Task(pictured, images=images, actions=options.actions, play=play)
     if task.environment is None:
         raise ValueError(
@@ -268,13 +270,18 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
     return task
 
 
+def images_of(cameras: Sequence[str]) -> list[str]:
+    """Return the names of cameras' images in files."""
+    return [f"{camera}_image" for camera in cameras]
+
+
 def with_images(
-    demonstrations: Demonstrations, cameras: Sequence[str], size: int, fast: bool
+    demonstrations: Demonstrations, images: Sequence[str], size: int, fast: bool
 ) -> Demonstrations:
     """Return demonstrations with images: the given ones, or those of a file rendered from them."""
     index = demonstrations.index()
-    if set(cameras) <= set(index.cameras):
-        stored_size = demonstrations.index(images=[f"{camera}_image" for camera in cameras]).image_size
+    if set(images) <= set(index.available_keys):
+        stored_size = demonstrations.index(images=images).image_size
         if stored_size != size:
             raise ValueError(
                 f"{index.path} has images of {stored_size} pixels: add --image-size {stored_size} (and a "
@@ -282,15 +289,19 @@ def with_images(
             )
         return demonstrations
     if not isinstance(demonstrations, RobomimicDemonstrations):
-        return demonstrations  # its reader names the missing cameras
+        return demonstrations  # its reader names the missing images
     if demonstrations.mask is not None:
         raise ValueError(
-            f"{demonstrations} has no images of {', '.join(cameras)}, and files are rendered whole: render "
+            f"{demonstrations} has no images {', '.join(images)}, and files are rendered whole: render "
             "it first (python benchmarks/demonstrations.py render), or leave the mask out"
         )
     rendered = copy.copy(demonstrations)
     rendered.place = render_demonstrations(
-        demonstrations.path, cameras, size, demos=demonstrations.demos, fast=fast
+        demonstrations.path,
+        [image.removesuffix("_image") for image in images],
+        size,
+        demos=demonstrations.demos,
+        fast=fast,
     )
     return rendered
 
@@ -312,8 +323,8 @@ def read_like(
     observations, pictures = facts.get("observation_keys"), []
     if images is not None:
         fast = images["fast_rendering"]
-        demonstrations = with_images(demonstrations, images["cameras"], images["size"], fast)
-        pictures = [f"{camera}_image" for camera in images["cameras"]]
+        pictures = images_of(images["cameras"])
+        demonstrations = with_images(demonstrations, pictures, images["size"], fast)
         observations = images["low_dim_keys"]
         check_images(demonstrations, demonstrations.index(observations, pictures), fast)
     steps = demonstrations.steps(
@@ -392,7 +403,7 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     options.check()
     names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
     if options.generated and any(name in TASKS for name in names):
-        counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
+        counts = ", ".join(f"{options.count(style)} {style}" for style in options.style)
         print(
             f"Data: {counts} scripted demonstrations per task, in place of the official human ones "
             "(--download). Success rates on them are not comparable with the paper's.",
@@ -401,7 +412,7 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     places: dict[tuple[str | None, str], None] = {}
     for name in names:
         one_style = name is not None and not is_simulated(name)
-        styles = options.data[: 1 if one_style else None]
+        styles = options.style[: 1 if one_style else None]
         if options.download and name in TASKS:
             published = tuple(style for style in styles if style in OFFICIAL.get(name, ()))
             if published and published != styles:

@@ -47,7 +47,7 @@ def test_a_command_line_changes_what_it_says_alone(tmp_path):
     for name, preset in PRESETS.items():
         found = read("--preset", name, out=tmp_path)
         assert replace(found, run=preset.run) == preset
-    words = "--task can stack --data ph mh --demonstrations 7 9 --hidden-dim 32 --learning-rate 0.5"
+    words = "--task can stack --style ph mh --demonstrations 7 9 --hidden-dim 32 --learning-rate 0.5"
     words += " --prior past --chunk 2 4 --sigma 0.1 0.2 --seeds 4 --seed 3 --nfe 1 5 --no-precondition"
     found = read(*words.split())
     assert found.data.task == ("can", "stack") and found.data.count("mh") == 9

@@ -124,7 +124,7 @@ def test_the_recipe_from_images(monkeypatch):
     asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
-    assert [(task, *adapted.data.data) for task in adapted.data.task] == list(MIMICGEN.values())
+    assert [(task, *adapted.data.style) for task in adapted.data.task] == list(MIMICGEN.values())
     counts = {found.data.demonstrations for found in mimicgen_tasks.FEW.values()}
     assert counts == {(facts.DEMONSTRATIONS["mimicgen"],)}
 

@@ -149,7 +149,7 @@ def test_papers_recipes():
         for arm in arms:
             config = recipe.agent(arm, 0)
             found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
-            assert (*found, recipe.horizon) == values
+            assert (*found, recipe.data.horizon) == values
             assert config.delta is None  # the paper's: 0.5 around a mean, 1.5 around zero
             assert config.backup_entropy  # of both baselines alike
     # Options of the command line stand above those of the task.

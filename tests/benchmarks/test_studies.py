@@ -180,7 +180,7 @@ def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(minari, 
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
         vector = test_minari.Box(-9, 9, (3,), "float32")
         place = f"minari:{test_minari.written(observation=vector, env='Pendulum-v1', expert_policy=None)}"
-        more = {"dataset": place, "task": None, "time_limit": 9}
+        more = {"dataset": place, "task": None, "horizon": 9}
     else:
         place = tmp_path / "lift.hdf5"
         write_robomimic_file(place, lengths=(30, 5, 40), task="lift")

@@ -41,14 +41,14 @@ def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validatio
 
 def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path, capfd):
     small = {"hidden_dim": 12, "batch_size": 16, "iterations": 6, "checkpoints": 1, "seeds": 1, "top_k": 1}
-    few = {"preset": "much-ado", "time_limit": 24, "prior": "past", **small}
+    few = {"preset": "much-ado", "horizon": 24, "prior": "past", **small}
     out = tmp_path / "run"
     assert robomimic.main(options(dataset, out, **few)) == 0
     (row,) = stored(out)
     # Three chunks, which solve nothing.
     assert (row["temperature"], row["actions"], row["mean_steps"]) == (0.0, "absolute", 24.0)
     report = (out / "report.md").read_text()
-    assert "time limit 24 (None)" in report and "count padding True (False)" in report
+    assert "horizon 24 (None)" in report and "count padding True (False)" in report
     folder = tmp_path / "policies" / row["policy"]
     policy = load_policy(folder / "policy_000006")
     assert policy.network.config().items() >= {"observation_layers": 2, "time_frequency": 1e-4}.items()
@@ -67,7 +67,7 @@ def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path
     # Runs of another time limit share the policy, and play it to their own.
     mine = with_parts(stored_options(Options, out, "robomimic"), run={"out": out})
     for limit, steps in ((24, 24), (None, 40)):
-        (shared,) = policies_of(with_parts(mine, data={"time_limit": limit}))
+        (shared,) = policies_of(with_parts(mine, data={"horizon": limit}))
         assert shared.name == row["policy"] and environment_of(shared.load()).horizon == steps
         assert shared.task().make_env().horizon == steps
 
@@ -126,7 +126,7 @@ def test_a_file_in_mimicgens_environment(tmp_path, monkeypatch):
     site, file, out = (tmp_path / name for name in ("site", "stack.hdf5", "out"))
     write_mimicgen(site)
     write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
-    few = {"task": None, "prior": "past", "demonstrations": 2, "time_limit": 9, "iterations": 4}
+    few = {"task": None, "prior": "past", "demonstrations": 2, "horizon": 9, "iterations": 4}
     argv = [*options(file, out, **few), "--no-videos"]
     assert apart(start)(Path(mimicgen_tasks.__file__), argv, site) == 0
     (row,), (task,) = stored(out), described(out, "tasks")

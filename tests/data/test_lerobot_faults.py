@@ -12,7 +12,6 @@ from tests.data.synthetic import env_args_15
 from tests.errors import raises
 from warmprior.data import DatasetError
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
-from warmprior.data.formats.lerobot_index import read_lerobot_index
 
 LIFT = env_args_15("lift")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -219,7 +218,7 @@ def test_bad_options(root):
     with raises(DatasetError, "'train'", "none"):
         LeRobotDemonstrations(root, mask="train").steps()
     with raises(DatasetError, "'robot0_eef_pos'"):
-        read_lerobot_index(root, poses=True)
+        LeRobotDemonstrations(root).index(poses=True)
     # Poses that are none: random numbers where a quaternion should be.
     with raises(DatasetError, "robot0_eef_quat", "episode 0", "row"):
         LeRobotDemonstrations(root, task=LIFT).steps(actions="absolute")

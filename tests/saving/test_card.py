@@ -54,7 +54,7 @@ def run(tmp_path):
 
 def test_its_numbers_are_those_of_the_results(run):
     policy = run.parent / "policies" / "drift-own-past-seed0" / "policy_000020"
-    card = model_card(ACTOR, **measured(policy_results(run, policy)), repository="me/drift", licence="mit")
+    card = model_card(ACTOR, **measured(policy_results(run, policy)), repository="me/drift", license="mit")
     for mine in (r for r in ROWS if (r["seed"], r["checkpoint"]) == (0, 20)):
         k = mine["successes"]
         low, high = stats.beta(1 + k, 6 - k).interval(0.95)

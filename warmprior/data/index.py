@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +60,12 @@ class DatasetIndex:
     lengths: tuple[int, ...]
     observation_keys: tuple[str, ...]
     observation_dims: tuple[int, ...]
-    image_keys: tuple[str, ...]
-    image_size: int
+    image_keys: tuple[str, ...] = ()
+    image_size: int = 0
     available_keys: tuple[str, ...]
     action_dim: int
-    env_args: dict[str, Any]
-    task: TaskSpec | None
+    env_args: dict[str, Any] = field(default_factory=dict)
+    task: TaskSpec | None = None
     whole: bool = True
     rate: float | None = None
 

@@ -110,8 +110,6 @@ class _Steps(Demonstrations):
             image_size=next(iter(self._images.values()), 0),
             available_keys=(OBSERVATION, *self._images),
             action_dim=self._values[ACTION].shape[-1],
-            env_args={},
-            task=None,
         )
 
     @override

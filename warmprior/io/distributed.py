@@ -91,6 +91,11 @@ def from_leader[T](make: Callable[[], T]) -> T:
     return parcel[0][0]
 
 
+def wait_for_leader() -> None:
+    """Wait until the first process has come as far as this one."""
+    from_leader(lambda: None)
+
+
 @contextmanager
 def leader_first() -> Iterator[None]:
     """Run a block in the first process, and afterwards in the others, which find the work done.

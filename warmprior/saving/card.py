@@ -20,7 +20,7 @@ def model_card(
     facts: Mapping[str, str] | None = None,
     success: str = "Not measured, or not known when this card was written.",
     repository: str = "user/name",
-    licence: str | None = None,
+    license: str | None = None,
 ) -> str:
     """Write the card of a policy, ``README.md`` of its repository at the hub.
 
@@ -32,19 +32,19 @@ def model_card(
         facts: further rows of the first table, such as those of the training.
         success: the section about success.
         repository: the repository that will hold the policy, such as ``"user/name"``.
-        licence: the hub's name of its licence, such as ``"mit"``.
+        license: the hub's name of its licence, such as ``"mit"``.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.saving import model_card
-        >>> card = model_card(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), licence="mit")
+        >>> card = model_card(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), license="mit")
         >>> "license: mit" in card, "`PastPrior(chunk_length=4, sigma=0.5, correlation=0.0)`" in card
         (True, True)
     """
     data = require("huggingface_hub", "sim").ModelCardData(
         library_name="warmprior",
         pipeline_tag="robotics",
-        license=licence,
+        license=license,
         tags=["robotics", "imitation-learning", "flow-matching", "torchrl", "warmprior"],
     )
     from warmprior.envs.description import environment_name

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
 
 from warmprior.checks import check_finite
-from warmprior.io.distributed import check_batch, from_leader, rank, world_size
+from warmprior.io.distributed import check_batch, from_leader, rank, wait_for_leader, world_size
 from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
@@ -179,7 +179,7 @@ class BehaviourCloning:
             return
         from_leader(lambda: check_writable(self.directory))
         with exclusive(self.directory) if not self.rank else nullcontext():
-            from_leader(lambda: None)  # wait until the first process has locked the folder
+            wait_for_leader()  # until it has locked the folder
             self._restore()  # another process may have trained since this object was built
             if from_leader(lambda: self.iteration) != self.iteration:
                 raise OSError(f"processes read different states at {self.state_path}: share the directory")

@@ -16,7 +16,7 @@ from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
 from warmprior.checks import check_device
-from warmprior.io.distributed import from_leader, world_size
+from warmprior.io.distributed import wait_for_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
@@ -199,7 +199,7 @@ def train_policy(
             compile=compile,
         )
         cloning.run(description, progress)
-        from_leader(lambda: None)  # other processes wait until the first has written the policy
+        wait_for_leader()  # until it has written the policy
         return load_policy(cloning.policy_path())
 
 

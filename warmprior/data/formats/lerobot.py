@@ -194,20 +194,14 @@ class LeRobotDemonstrations(Demonstrations):
     def index(
         self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
     ) -> LeRobotIndex:
-        task = self.task
-        if isinstance(task, str):
-            task = task_env_args(task) if task in TASKS else None
-        return read_lerobot_index(
-            self.place,
-            revision=self.revision,
-            mask=self.mask,
-            observations=observations,
-            images=images,
-            poses=poses,
-            demos=self.demos,
-            episodes=self.episodes,
-            env_args=task,
-        )
+        return read_lerobot_index(self, observations, images, poses)
+
+    @property
+    def env_args(self) -> Mapping[str, Any]:
+        """The description of the environment that the task names; empty without one."""
+        if isinstance(self.task, str):
+            return task_env_args(self.task) if self.task in TASKS else {}
+        return self.task or {}
 
     def fetched(self, index: DatasetIndex) -> LeRobotIndex:
         """Return an index of files that are on this machine."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise, product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from warmprior.data.index import (
     DatasetError,
@@ -25,6 +25,9 @@ from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
 from warmprior.lerobot.names import short_names
+
+if TYPE_CHECKING:
+    from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
 DESCRIPTION = "meta/warmprior.json"
 """The file that :func:`warmprior.data.convert_robomimic` adds to LeRobot's own, and that LeRobot ignores."""
@@ -227,28 +230,21 @@ def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
 
 
 def read_lerobot_index(
-    dataset: str | Path,
-    *,
-    revision: str | None = None,
-    mask: str | None = None,
-    observations: Sequence[str] | None = None,
-    images: Sequence[str] = (),
-    poses: bool = False,
-    demos: int | None = None,
-    episodes: Sequence[int] | None = None,
-    env_args: Mapping[str, Any] | None = None,
+    demonstrations: LeRobotDemonstrations,
+    observations: Sequence[str] | None,
+    images: Sequence[str],
+    poses: bool,
 ) -> LeRobotIndex:
     """Return the index of a LeRobotDataset v3 from its ``meta/``, without reading values.
 
-    From a dataset on the hub only ``meta/`` is fetched. Options and errors are those of
-    :class:`LeRobotDemonstrations`; ``poses`` also requires the hand pose of every arm, from
-    which absolute actions are built.
+    From a dataset on the hub only ``meta/`` is fetched.
     """
+    dataset, revision, env_args = demonstrations.place, demonstrations.revision, demonstrations.env_args
     remote = is_remote(dataset)
     root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()
     metadata = _metadata(root)
     described = _description(root)
-    recorded = described.get("env_args") or dict(env_args or {})
+    recorded = described.get("env_args") or dict(env_args)
     name = recorded.get("env_name")
     if env_args and name != env_args["env_name"]:
         raise DatasetError(f"{root} was recorded in {name}, not in {env_args['env_name']}: correct env_args")
@@ -287,8 +283,9 @@ def read_lerobot_index(
     images = [own.get(name, name) for name in images]
     rows = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     count = len(rows)
-    if episodes is not None:
-        rows = [rows[number] for number in _chosen(root, "episodes", episodes, count)]
+    if demonstrations.episodes is not None:
+        rows = [rows[number] for number in _chosen(root, "episodes", demonstrations.episodes, count)]
+    mask = demonstrations.mask
     if mask is not None:
         masks = described.get("masks", {})
         if mask not in masks:
@@ -297,8 +294,8 @@ def read_lerobot_index(
         if not chosen:
             raise DatasetError(f"{root}: the mask {mask!r} names no episode: choose another, or none")
         rows = [row for row in rows if row["episode_index"] in chosen]
-    check_count(root, demos, len(rows))
-    count, rows = len(rows), rows[:demos]
+    check_count(root, demonstrations.demos, len(rows))
+    count, rows = len(rows), rows[: demonstrations.demos]
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),

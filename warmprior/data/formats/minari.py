@@ -179,8 +179,6 @@ class MinariDemonstrations(Demonstrations):
             image_size=common_size(where, {pictures[key][0]: key for key in images}),
             available_keys=(*vectors, *pictures),
             action_dim=action.shape[0],
-            env_args={},
-            task=None,
             whole=self.demos in (None, dataset.total_episodes),
         )
 
