@@ -252,7 +252,7 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         if not images:
             raise ValueError(f"{path} has no images, and its task is unknown: name --images")
         pictured = with_images(demonstrations, images, options.image_size, options.fast_rendering)
-    play = Play(horizon=options.horizon, fast_rendering=options.fast_rendering)
+    play = Play(horizon=options.horizon, fast_rendering=bool(images) and options.fast_rendering)
     task = Task(pictured, images=images, actions=options.actions, play=play)
     if task.environment is None:
         raise ValueError(

@@ -47,7 +47,7 @@ def test_curvature_of_a_finished_run_trains_nothing(finished, dataset, validatio
     base = [row for row in rows if row["prior"] == "gaussian"]
     assert len(base) == 3 and all(row["ratio"] in (1.0, None) for row in base)
     assert all(row["speed"] > 0 and row["observations"] == 20 for row in rows)
-    assert "20 observations of val.hdf5, 2 seed(s)" in report and "not held out" not in report
+    assert "20 observations of val.hdf5, 2 seeds" in report and "not held out" not in report
     assert is_png(out / "flow_paths.png")
     # The same options find the same policies; the training data are allowed, but called what they are.
     own = finished.parent / "own"

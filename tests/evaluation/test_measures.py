@@ -11,7 +11,7 @@ from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing,
 from warmprior import ChunkStep, PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
 from warmprior.evaluation import evaluate, parallel_env, play_episode
-from warmprior.tasks import Task
+from warmprior.tasks import Play
 
 H = 4
 HOW = {"high": "max", "effort": "sum", "left": "last"}
@@ -90,8 +90,8 @@ def test_keys_that_are_not_there_are_named():
 
 def test_another_way_to_combine_values_is_refused():
     measures, env = {"high": "mean"}, make_env(execute=1)
-    task = partial(Task, "own", "human", env.fake_tensordict(), Saying)
-    for use in (partial(ChunkStep, H), task, partial(play_episode, POLICY, env, 0, success="won")):
+    play = partial(Play, Saying)
+    for use in (partial(ChunkStep, H), play, partial(play_episode, POLICY, env, 0, success="won")):
         with raises(ValueError, "'high'", "max, sum, last", "'mean'"):
             use(measures=measures)
 

@@ -184,7 +184,7 @@ class FlowMatchingLoss(Drawing, LossModule):
         device = device_of(actor.network, tensordict.get(k.chunk))
         a1, history, observation = (_moved(tensordict.get(key), device) for key in needed)
         check_positions(k.chunk, a1, actor.prior)
-        if not self._looked_at:
+        if not (self._looked_at or a1.is_meta or torch.compiler.is_compiling()):  # a number is read
             self._check_normalised(a1)
         a1 = a1 if a1.is_floating_point() else a1.to(torch.get_default_dtype())
         weight, masked = self._weight(tensordict, a1)
