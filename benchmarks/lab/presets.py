@@ -15,7 +15,7 @@ PRESETS: dict[str, Options] = {
     "quick": Options(
         data=DataOptions(task=("can",), demonstrations=(25,)),
         training=TrainingConfig(iterations=5_000),
-        evaluation=Evaluation(episodes=50, nfe=(9, 1)),
+        evaluation=Evaluation(episodes=30, nfe=(9, 1)),
     ),
     # Three seeds, with twice the training and the episodes.
     "cpu": Options(data=DataOptions(demonstrations=(150, 300)), evaluation=Evaluation(seeds=3, episodes=50)),
