@@ -54,9 +54,11 @@ print(actor(batch)["vla_action", "chunk"].shape)
 # TorchRL imports simulators itself where they are installed.
 LOADED = """
 import sys
+import warmprior
+assert "torch" not in sys.modules  # it takes seconds: the first public name imports it
 import torchrl.collectors, torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.record
 before = set(sys.modules)
-import warmprior
+assert warmprior.PastPrior.__name__ in warmprior.__all__ and not hasattr(warmprior, "unknown")
 print(*sys.modules)
 import warmprior.training
 print(*set(sys.modules) - before)

@@ -6,24 +6,40 @@ The public names of :mod:`warmprior.modules`, :mod:`warmprior.transforms`,
 name; parts of them need the extra ``warmprior[sim]``.
 """
 
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 from warmprior.io.renderer import leave_out_broken_renderer
 
-leave_out_broken_renderer()  # before TorchRL is imported
+if TYPE_CHECKING:
+    from warmprior.modules import *  # noqa: F403
+    from warmprior.objectives import *  # noqa: F403
+    from warmprior.rl import *  # noqa: F403
+    from warmprior.transforms import *  # noqa: F403
 
-# isort: split
-from warmprior import modules, objectives, rl, transforms  # noqa: E402
-from warmprior.modules import *  # noqa: F403, E402
-from warmprior.objectives import *  # noqa: F403, E402
-from warmprior.rl import *  # noqa: F403, E402
-from warmprior.transforms import *  # noqa: F403, E402
+leave_out_broken_renderer()  # before TorchRL is imported
 
 __version__ = version("warmprior")
 
-# A public name is declared once, where it lives.
-__all__ = ["__version__"]
-__all__ += modules.__all__
-__all__ += objectives.__all__
-__all__ += rl.__all__
-__all__ += transforms.__all__
+
+def __getattr__(name: str) -> Any:
+    """Return a room, or import the public names when the first is used: PyTorch and TorchRL take seconds."""
+    if name.startswith("__") and name != "__all__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if find_spec(f"{__name__}.{name}"):
+        return import_module(f"{__name__}.{name}")
+    public = {"__version__": __version__}
+    for room in ("modules", "objectives", "rl", "transforms"):
+        module = import_module(f"{__name__}.{room}")
+        public |= {each: getattr(module, each) for each in module.__all__}
+    globals().update(public, __all__=[*public])
+    if name not in globals():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted({*globals(), *__getattr__("__all__")})

@@ -11,6 +11,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+if __name__ == "__main__":
+    print("warmprior: importing PyTorch", file=sys.stderr, flush=True)  # it takes seconds
+
+# isort: split
 import torch
 import tyro
 from tensordict import TensorDict, TensorDictBase

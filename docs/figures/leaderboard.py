@@ -9,6 +9,7 @@ from draws of all means.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,26 +44,32 @@ PAGE = DOCS / "leaderboard.md"
 DOOR = "door, 25"
 PUSHT = "pusht"
 DRAWS = 2_000  # of the means, for the intervals of ranks
-Sets = Mapping[str, tuple[str, Sequence[str]]]
-"""By name of the demonstrations: the task, and the runs that have its rows."""
 
-HUMAN: Sets = {
-    name: (task, (run, f"{run}_l1", f"{run}_others"))
+
+class Sets(dict[str, tuple[str, Sequence[str]]]):
+    """By name of the demonstrations: the task, and the runs that have its rows."""
+
+    __hash__ = object.__hash__  # nobody changes them, so what follows from their rows is computed once
+
+
+HUMAN = Sets(
+    (name, (task, (run, f"{run}_l1", f"{run}_others")))
     for name, task, run in (
         (DOOR, "adroit-door-human-v0", "door_20000"),
         ("Push-T, 25", PUSHT, "pusht_25"),
         ("Push-T, 50", PUSHT, "pusht_50"),
         ("Push-T, 206", PUSHT, "pusht_206_45000"),
     )
-}
+)
 
-SCRIPTED: Sets = {f"{task}, 25": (task, GROUPS[TWENTY_FIVE]) for task in ("square", "can", "stack")}
+SCRIPTED = Sets((f"{task}, 25", (task, GROUPS[TWENTY_FIVE])) for task in ("square", "can", "stack"))
 TITLES = {
     "Human demonstrations: the mean of four sets": HUMAN,
     "25 scripted demonstrations: the mean of three tasks": SCRIPTED,
 }
 
 
+@cache
 def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
     """Return the rows of all sets, by default at the noise of each source's training (MIP's is 0)."""
     played = {name: concat(map(read_played, runs)) for name, (_, runs) in sets.items()}
@@ -70,6 +77,7 @@ def trials(sets: Sets = HUMAN, own_noise: bool = True) -> DataFrame:
     return with_own_noise(rows) if own_noise else rows
 
 
+@cache
 def beside_source(
     source: str, nfe: int, baseline: str = GAUSSIAN, sets: Sets = HUMAN, own_noise: bool = True
 ) -> Comparison:
@@ -96,6 +104,7 @@ def beside_source(
     return compare(*zip(*cells, strict=True))
 
 
+@cache
 def with_best_noise(sets: Sets = HUMAN) -> dict[tuple[str, int], float]:
     """Return the mean success per method and NFE, each with its best noise, chosen on other episodes."""
     rates: dict[tuple[str, int], list[float]] = {}
@@ -105,6 +114,7 @@ def with_best_noise(sets: Sets = HUMAN) -> dict[tuple[str, int], float]:
     return {setting: float(np.mean(of)) for setting, of in rates.items() if len(of) == len(sets)}
 
 
+@cache
 def standings(sets: Sets = HUMAN) -> DataFrame:
     """Return success per method and NFE in percent, by set and on average, with ranks and intervals.
 
