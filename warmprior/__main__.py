@@ -26,6 +26,7 @@ from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior
+from warmprior.modules.resize import Resizing
 from warmprior.saving import load_policy, model_card
 from warmprior.saving.policies import (
     check_repository,
@@ -261,7 +262,7 @@ def improve(
 
 
 @dataclass(frozen=True)
-class Data:
+class Data(Resizing):
     """The options of the demonstrations, and of the task that is learnt from them.
 
     Attributes:
@@ -327,7 +328,13 @@ def train(
     source, options = make(Prior, prior, chunk), prior.split(",")[1:]
     sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
-        place, demos=data.demonstrations, mask=data.mask, style=data.style, task=data.task
+        place,
+        demos=data.demonstrations,
+        mask=data.mask,
+        style=data.style,
+        task=data.task,
+        image_size=data.image_size,
+        resize=data.resize,
     )
     whole = Task(
         demonstrations,

@@ -55,9 +55,9 @@ SMALL_IMAGES: dict[str, dict[str, Any]] = {
 IMAGES: dict[str, dict[str, dict[str, Any]]] = {
     "quick": {**SMALL_IMAGES, "evaluation": {"nfe": (3, 1), "episodes": 25}},
     "cpu": SMALL_IMAGES,
-    "paper": {"training": {"batch_size": 256}},
+    "paper": {"data": {"image_size": 84}, "training": {"batch_size": 256}},
     "much-ado": {
-        "data": {"actions": "delta"},  # image policies support no others
+        "data": {"actions": "delta", "image_size": 84},  # image policies support no other actions
         "network": {"encoder": "resnet18"},
         "training": {"batch_size": 256},
     },

@@ -20,12 +20,13 @@ from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, digest_of, exclusive, file_digest, write_atomic
 from warmprior.io.machine import available_memory
+from warmprior.modules.resize import IMAGE_SIZE
 
 
 def render_demonstrations(
     path: str | Path,
     cameras: Sequence[str] | None = None,
-    size: int = 84,
+    size: int = IMAGE_SIZE,
     *,
     demos: int | None = None,
     fast: bool = False,
@@ -126,7 +127,7 @@ class _Illustrator(StateRenderer):
     def __init__(
         self, index: DatasetIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
     ) -> None:
-        super().__init__(index, size, fast)
+        super().__init__(index, (size, size), fast)
         self.cameras, self.parts = cameras, parts
 
     def part(self, demo: str) -> Path:
@@ -186,7 +187,7 @@ def _rendered_before(
 
 def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
     """Write the file with the images of the demos, and its masks if no demo is left out."""
-    h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
+    h5py, (size, _), index = require("h5py", "sim"), illustrator.size, illustrator.index
     kwargs = {"camera_names": list(illustrator.cameras), "camera_heights": size, "camera_widths": size}
     env_args = index.env_args | {"env_kwargs": index.env_args["env_kwargs"] | kwargs}
     with open_robomimic(index.path) as source, h5py.File(path, "w") as file:

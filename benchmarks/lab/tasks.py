@@ -29,6 +29,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
 from warmprior.modules.encoder import imagenet_weights
+from warmprior.modules.resize import IMAGE_SIZE, Resizing
 from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions
 from warmprior.training.options import OF_IMAGES, PRETRAINED
@@ -85,7 +86,7 @@ def resolved_place(place: Path) -> str:
 
 
 @dataclass(frozen=True)
-class DataOptions:
+class DataOptions(Resizing):
     """Options of the demonstrations that policies are trained on.
 
     Attributes:
@@ -105,7 +106,6 @@ class DataOptions:
         obs: observations of the policies: state of robot and objects, or state of the robot and images
         images: images, such as agentview_image (default: those of the task's two cameras, or four with two
             arms)
-        image_size: side of the images in pixels
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster
 
     Examples:
@@ -126,7 +126,6 @@ class DataOptions:
     actions: Actions = "delta"
     obs: Literal["state", "image"] = "state"
     images: tuple[str, ...] = ()
-    image_size: int = 84
     fast_rendering: bool = False
 
     def __post_init__(self) -> None:
@@ -221,10 +220,11 @@ def check_network(network: NetworkOptions, data: DataOptions) -> None:
     """Raise an error for options of images that do not fit, and for pretrained weights that are missing."""
     if data.obs == "state":
         usual = without_images(network) == network or network.encoder == "resnet18"
-        if not usual or data.image_size != DataOptions().image_size:
-            raise ValueError("--image-size, --crop-size, --share-encoder and --encoder belong to --obs image")
+        if not usual or (data.image_size, data.resize) != (None, "squeeze"):
+            names = "--image-size, --resize, --crop-size, --share-encoder and --encoder"
+            raise ValueError(f"{names} belong to --obs image")
         return
-    if not 8 <= network.crop_size <= data.image_size:
+    if data.image_size and network.crop_size and not 8 <= network.crop_size <= data.image_size:
         raise ValueError(
             f"--crop-size {network.crop_size} must be at least 8 and at most --image-size {data.image_size}"
         )
@@ -243,6 +243,8 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         mask=options.mask,
         style=style,
         task=next(iter(options.task), None) if source == "file" else None,
+        image_size=options.image_size,
+        resize=options.resize,
     )
     images: Sequence[str] = ()
     pictured = demonstrations
@@ -251,7 +253,7 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         images = options.images or images_of(index.task.cameras if index.task else index.cameras)
         if not images:
             raise ValueError(f"{path} has no images, and its task is unknown: name --images")
-        pictured = with_images(demonstrations, images, options.image_size, options.fast_rendering)
+        pictured = with_images(demonstrations, images, options.fast_rendering)
     play = Play(horizon=options.horizon, fast_rendering=bool(images) and options.fast_rendering)
     task = Task(pictured, images=images, actions=options.actions, play=play)
     if task.environment is None:
@@ -275,21 +277,11 @@ def images_of(cameras: Sequence[str]) -> list[str]:
     return [f"{camera}_image" for camera in cameras]
 
 
-def with_images(
-    demonstrations: Demonstrations, images: Sequence[str], size: int, fast: bool
-) -> Demonstrations:
+def with_images(demonstrations: Demonstrations, images: Sequence[str], fast: bool) -> Demonstrations:
     """Return demonstrations with images: the given ones, or those of a file rendered from them."""
     index = demonstrations.index()
-    if set(images) <= set(index.available_keys):
-        stored_size = demonstrations.index(images=images).image_size
-        if stored_size != size:
-            raise ValueError(
-                f"{index.path} has images of {stored_size} pixels: add --image-size {stored_size} (and a "
-                "smaller --crop-size), or render it again"
-            )
-        return demonstrations
-    if not isinstance(demonstrations, RobomimicDemonstrations):
-        return demonstrations  # its reader names the missing images
+    if set(images) <= set(index.available_keys) or not isinstance(demonstrations, RobomimicDemonstrations):
+        return demonstrations  # a reader names missing images
     if demonstrations.mask is not None:
         raise ValueError(
             f"{demonstrations} has no images {', '.join(images)}, and files are rendered whole: render "
@@ -299,7 +291,7 @@ def with_images(
     rendered.place = render_demonstrations(
         demonstrations.path,
         [image.removesuffix("_image") for image in images],
-        size,
+        demonstrations.image_size or IMAGE_SIZE,
         demos=demonstrations.demos,
         fast=fast,
     )
@@ -316,15 +308,16 @@ def read_like(
     Raises:
         ValueError: if the demonstrations are of another task.
     """
-    demonstrations = open_demonstrations(place, mask=mask, task=name)
+    images = facts.get("images")
+    sized = {} if images is None else {"image_size": images["size"], "resize": images["resize"]}
+    demonstrations = open_demonstrations(place, mask=mask, task=name, **sized)
     if (stored := demonstrations.index().task_name) != name:  # before images are rendered
         raise ValueError(f"{place} has demonstrations of {stored}, but the policies are for {name}")
-    images, called = facts.get("images"), demonstrations.name
-    observations, pictures = facts.get("observation_keys"), []
+    called, observations, pictures = demonstrations.name, facts.get("observation_keys"), []
     if images is not None:
         fast = images["fast_rendering"]
         pictures = images_of(images["cameras"])
-        demonstrations = with_images(demonstrations, pictures, images["size"], fast)
+        demonstrations = with_images(demonstrations, pictures, fast)
         observations = images["low_dim_keys"]
         check_images(demonstrations, demonstrations.index(observations, pictures), fast)
     steps = demonstrations.steps(

@@ -89,7 +89,9 @@ def recipe(options):
         "observation_steps": options.network.observation_steps,
     }
     if options.data.obs == "image":
-        found |= values(options.network, ("encoder", "crop_size")) | values(options.data, ("image_size",))
+        sizes = {"image_size": options.data.image_size, "crop_size": options.network.crop_size}
+        encoder = ImageEncoder(["camera"], 0, backbone="small", **sizes)
+        found |= {"encoder": options.network.encoder, **values(encoder, ("image_size", "crop_size"))}
     return found
 
 
@@ -117,7 +119,8 @@ def test_the_recipe_from_the_state(name, monkeypatch):
 
 
 def test_the_recipe_from_images(monkeypatch):
-    assert recipe(with_parts(PRESETS["paper"], **IMAGES["paper"], data={"obs": "image"})) == IMAGE
+    paper = with_parts(PRESETS["paper"], **IMAGES["paper"])
+    assert recipe(with_parts(paper, data={"obs": "image"})) == IMAGE
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
     monkeypatch.setattr("lab.presets.imagenet_weights", lambda: None)  # nothing is downloaded
@@ -188,9 +191,8 @@ def test_defaults_of_the_library():
     assert STATE.items() >= optimized(make_optimizer(VelocityMLP(1, 1, 1, hidden_dim=8))).items()
     assert default(warmup_cosine, "warmup_ratio") == STATE["warmup_ratio"]
     assert default(ema_of, "rate") == STATE["ema_rate"]
-    assert {
-        name: default(ImageEncoder, name) for name in ("image_size", "crop_size")
-    }.items() <= IMAGE.items()
+    encoder = ImageEncoder(["camera"], 0, backbone="small")
+    assert IMAGE.items() >= values(encoder, ("image_size", "crop_size")).items()
 
 
 def test_the_images_network_has_group_norm():
@@ -338,7 +340,10 @@ def test_the_policy_for_lerobot():
 
     config = WarmFlowConfig()
     names = ("embedding_dim", "num_layers", "num_heads", "dropout", "ema_rate")
-    assert IMAGE.items() >= values(config, (*names, "encoder", "image_size", "crop_size")).items()
+    assert (
+        IMAGE.items() >= values(config, (*names, "encoder", "image_size")).items()
+        and config.crop_size is None
+    )
     weights = [nn.Parameter(torch.zeros(1))]
     assert IMAGE.items() >= optimized(config.get_optimizer_preset().build(weights)).items()
     assert WarmupRatioConfig().warmup_ratio == IMAGE["warmup_ratio"]

@@ -27,7 +27,7 @@ class Table(DemonstrationReader):
     def numbers(self, demo, key, out, first=0):
         out[...] = self.tables[int(demo)][first : first + len(out), COLUMNS[key]]
 
-    def images(self, demo, key, out):
+    def images(self, demo, key):
         raise NotImplementedError
 
     def name(self, demo, key):

@@ -149,7 +149,7 @@ VALUES = {
 MOVIE = "videos/observation.images.side/chunk-000/file-000.mp4"
 IMAGES = {
     "missing camera": (lambda root: None, ["'front_image'", "agentview_image"], "front_image"),
-    "not square": (feature(CAMERA, shape=[32, 16, 3]), ["square"], "agentview_image"),
+    "one colour": (feature(CAMERA, shape=[32, 32, 1]), [CAMERA, "(32, 32, 1)"], "agentview_image"),
     "other size": (
         feature(CAMERA, shape=[16, 16, 3]),
         [DATA, CAMERA, "3, 32, 32]", "3, 16, 16]"],

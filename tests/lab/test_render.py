@@ -187,9 +187,8 @@ def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
     [
         (lambda images: images / 255, ("float64", "uint8")),
         (lambda images: images[..., :2], ("(4, 16, 16, 2)", "uint8")),
-        (lambda images: images[:3], ("(3, 16, 16, 3)", "(4, side")),
-        (lambda images: images[:, :8], ("(4, 8, 16, 3)", "side, side")),
-        (lambda images: images[:, :8, :8], ("obs/agentview_image", 16)),
+        (lambda images: images[:3], ("(3, 16, 16, 3)", "(4, height")),
+        (lambda images: images[:, :8], ("agentview_image", "(8, 16)", "(16, 16)")),
         (None, ("'agentview_image'", "robot0_eye_in_hand_image")),
     ],
 )

@@ -17,6 +17,7 @@ from warmprior import (
 )
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.history import cold_history
+from warmprior.modules.resize import resized
 from warmprior.training import precondition
 
 pytestmark = NEEDS_PLUGIN
@@ -238,6 +239,11 @@ def test_the_flow_policy_sees_images(found, tmp_path):
 
     policy.save_pretrained(tmp_path / "saved")
     again = found["warm_flow"].from_pretrained(tmp_path / "saved").eval()
+    frames = torch.randint(256, (3, 2, 3, 48, 64), generator=torch.Generator().manual_seed(2)).byte()
+    assert torch.equal(again._pixels(frames / 255), resized(frames, (16, 16)))
+    again.config.resize = "pad"
+    assert torch.equal(again._pixels(frames / 255), resized(frames, (16, 16), "pad"))
+    again.config.resize = "squeeze"
     flat = torch.full((2, 3, 20, 24), 0.4)  # any size and shape is resized
     start = {"observation.state": torch.zeros(2, 3), "observation.environment_state": torch.zeros(2, 2)}
     actions = []

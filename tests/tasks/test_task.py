@@ -214,10 +214,9 @@ def test_data_that_cannot_be_are_named():
     ):
         with raises(error, *facts):
             own(steps(**changed), CountingEnv, name=name)
-    for shapes in ({"front": (3, 32, 48)}, {"front": (3, 32, 32), "wrist": (3, 16, 16)}):
-        images = {name: torch.zeros(40, *shape, dtype=torch.uint8) for name, shape in shapes.items()}
-        with raises(ValueError, "own", f"'{[*shapes][-1]}'", "size"):
-            own(steps(observation=TensorDict(images | {"state": torch.rand(40, 2)}, [40])))
+    for image in (torch.zeros(40, 32, 48, 3, dtype=torch.uint8), torch.zeros(40, 3, 32, 48)):
+        with raises(ValueError, "own", "'front'", tuple(image.shape), image.dtype, "[N, 3, h, w]"):
+            own(steps(observation=TensorDict({"front": image, "state": torch.rand(40, 2)}, [40])))
     fitting = {"observation": torch.randn(40, 9), "action": torch.rand(40, 1)}
     own(steps(**fitting), NavigationEnv).check_environment()
     for changed in ({"observation": torch.randn(40, 5)}, {"action": torch.rand(40, 3)}):

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +30,7 @@ from warmprior.data.index import DatasetError, DatasetIndex, declared_poses
 from warmprior.data.steps import solved
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
-from warmprior.keys import ACTION, OBSERVATION, STATE
+from warmprior.keys import ACTION, OBSERVATION
 
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # the smallest side in pixels; the AV1 encoder ends the process below it
@@ -91,7 +91,7 @@ def convert_robomimic(
         if not keys:
             raise DatasetError(f"{path} has no images: render them first, or use images=None")
         index = demonstrations.index(observations, keys)
-        side = index.image_size
+        side = min(map(min, index.image_shapes))
         if images == "video" and side < VIDEO_SIZE:
             raise ValueError(f"{path}: a video needs {VIDEO_SIZE} pixels, not {side}; use images='image'")
     if os.path.lexists(folder):
@@ -131,8 +131,8 @@ def _features(
     features = {name: feature("float32", (size,), names[name]) for name, size in sizes.items()}
     kinds = {name: "bool" if value.dtype == torch.bool else "float32" for name, value in outcome.items()}
     features |= {name: feature(kind, (1,), None) for name, kind in kinds.items()}
-    pixels, sides = (index.image_size, index.image_size, 3), ["height", "width", "channels"]
-    return features | {_camera(key): feature(str(images), pixels, sides) for key in index.image_keys}
+    sides, shapes = ["height", "width", "channels"], zip(index.image_keys, index.image_shapes, strict=True)
+    return features | {_camera(key): feature(str(images), (*shape, 3), sides) for key, shape in shapes}
 
 
 def _camera(key: str) -> str:
@@ -148,8 +148,7 @@ def _write(
     images: Literal["image", "video"] | None,
 ) -> None:
     layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
-    storage: Any = "memmap" if images else "memory"
-    data = demonstrations.steps(index.observation_keys, index.image_keys, actions="stored", storage=storage)
+    data = demonstrations.steps(index.observation_keys, actions="stored")
     outcome = _outcome(data, index)
     dataset = datasets.LeRobotDataset.create(
         f"local/{root.name}",
@@ -159,19 +158,19 @@ def _write(
         use_videos=images == "video",
     )
     numbers = {"action": data[ACTION], **outcome}
-    vector = data[OBSERVATION, STATE] if images else data[OBSERVATION]
-    parts = dict(zip(index.observation_keys, vector.split(index.observation_dims, -1), strict=True))
+    vectors = data[OBSERVATION].split(index.observation_dims, -1)
+    parts = dict(zip(index.observation_keys, vectors, strict=True))
     for feature, widths in layout.items():
         numbers[feature] = torch.cat([parts[key] for key in widths], -1)
     rows = np.cumsum([0, *index.lengths])
     bar = tqdm(pairwise(rows), f"convert {index.path.stem}", len(index.lengths), unit="demo")
-    with quietly():
+    with quietly(), demonstrations.reader(index) as reader:
         try:
-            for start, stop in bar:
+            for demo, (start, stop) in zip(index.demos, bar, strict=True):
+                pictures = {key: chain.from_iterable(reader.images(demo, key)) for key in index.image_keys}
                 for row in range(start, stop):
                     frame = {name: value[row].numpy() for name, value in numbers.items()}
-                    for key in index.image_keys:
-                        frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
+                    frame |= {_camera(k): next(p).permute(1, 2, 0).numpy() for k, p in pictures.items()}
                     dataset.add_frame(frame | {"task": index.task_name})
                 # Parallel encoding would start a process, which imports LeRobot, per camera and episode.
                 dataset.save_episode(parallel_encoding=False)

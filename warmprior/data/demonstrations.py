@@ -6,14 +6,16 @@ import copy
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 from tensordict import TensorDictBase
 
+from warmprior.checks import check_choice, check_whole_numbers, given
 from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
+from warmprior.modules.resize import IMAGE_SIZE, Resize
 
 
 class Demonstrations:
@@ -29,6 +31,9 @@ class Demonstrations:
         mask: a mask of the place, such as ``"train"``, which selects some demonstrations.
         style: style of the recording, such as ``"ph"`` or ``"human"``, which decides robosuite's time limit.
         task: the task of robosuite, or its ``env_args``, for a place that does not describe its environment.
+        image_size: side in pixels to which images are resized; by default squares of one size stay as they
+            are, and others are resized to 84.
+        resize: how images are resized, see :func:`~warmprior.modules.resize.resized`.
 
     Examples:
         >>> import torch
@@ -54,8 +59,13 @@ class Demonstrations:
         mask: str | None = None,
         style: str | None = None,
         task: str | Mapping[str, Any] | None = None,
+        image_size: int | None = None,
+        resize: Resize = "squeeze",
     ) -> None:
+        check_whole_numbers(**given(image_size=image_size))
+        check_choice("resize", resize, get_args(Resize))
         self.place, self.demos, self.mask, self.style, self.task = place, demos, mask, style, task
+        self.image_size, self.resize = image_size, resize
 
     @property
     def title(self) -> str:
@@ -123,6 +133,18 @@ class Demonstrations:
         """Return the index, from names and shapes alone; with ``poses`` every arm's pose must be there."""
         raise NotImplementedError
 
+    def pictured(self, images: Sequence[str], shapes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+        """Return the entries of an index for images, given their heights and widths as they are stored."""
+        found = tuple(shapes[key] for key in images)
+        sides = {side for shape in found for side in shape}
+        size = self.image_size or (IMAGE_SIZE if len(sides) > 1 else max(sides, default=0))
+        return {
+            "image_keys": tuple(images),
+            "image_shapes": found,
+            "image_size": size if images else 0,
+            "resize": self.resize,
+        }
+
     def reader(self, index: DatasetIndex) -> AbstractContextManager[DemonstrationReader]:
         """Return a reader of the values, which is open until the context ends."""
         raise NotImplementedError
@@ -156,7 +178,8 @@ class Demonstrations:
         """Read the demonstrations as one flat, contiguous TensorDict of ``N`` steps.
 
         - ``"observation"`` ``[N, d_o]`` float32, the concatenated observations; with images it is nested:
-          ``("observation", "state")`` ``[N, d_s]``, and each image uint8 ``[N, 3, size, size]``;
+          ``("observation", "state")`` ``[N, d_s]``, and each image uint8 ``[N, 3, size, size]``,
+          resized as the demonstrations' options say;
         - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
         - ``("next", "reward")`` ``[N, 1]`` float32, zeros if none is recorded;
         - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done

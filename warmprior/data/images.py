@@ -14,7 +14,6 @@ from warmprior.data.index import DatasetError, DatasetIndex, store_finite
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer
 from warmprior.envs.simulator import make_simulator, scene_stays
-from warmprior.keys import OBSERVATION
 
 RENDERER_VERSION = 2
 """The version of rendering here; it is raised whenever the same states give other images."""
@@ -31,7 +30,7 @@ def renderer_versions() -> tuple[int | str, ...]:
 class StateRenderer:
     """A renderer of demonstrations' states; it builds its simulator when first needed."""
 
-    def __init__(self, index: DatasetIndex, size: int, fast: bool) -> None:
+    def __init__(self, index: DatasetIndex, size: tuple[int, int], fast: bool) -> None:
         self.index, self.size, self.fast = index, size, fast
 
     @cached_property
@@ -42,7 +41,7 @@ class StateRenderer:
             what = f"{type(env).__name__} moves fixtures at resets: images do not follow from states"
             raise DatasetError(f"{self.index.path}: {what}")
         model = env.sim.model._model
-        return CameraRenderer(model, self.size, self.size, fast=self.fast)
+        return CameraRenderer(model, *self.size, fast=self.fast)
 
     def joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:
         """Return the positions of all joints, ``[steps, nq]``, in states of this simulator."""
@@ -78,7 +77,7 @@ class StateRenderer:
 
 
 def check_images(demonstrations: Demonstrations, index: DatasetIndex, fast: bool) -> None:
-    """Compare the first images of an index with the simulator's.
+    """Compare the first images of an index, as they are stored, with the simulator's.
 
     Raises DatasetError if they differ, or were rendered in the other quality; warns if there is no state, or
     this machine cannot render, or lacks the simulator.
@@ -89,10 +88,13 @@ def check_images(demonstrations: Demonstrations, index: DatasetIndex, fast: bool
         raise DatasetError(f"{index.path}: its images were rendered {how}: use fast_rendering={not fast}")
     why = "it holds no states"
     if state is not None:
-        first = demonstrations.only(1).steps(index.observation_keys, index.image_keys)[OBSERVATION][0]
-        images = {key.removesuffix("_image"): first[key].permute(1, 2, 0).numpy() for key in index.image_keys}
+        with demonstrations.reader(index) as reader:
+            first = {key: next(reader.images(index.demos[0], key))[0] for key in index.image_keys}
+        images = {key.removesuffix("_image"): image.permute(1, 2, 0).numpy() for key, image in first.items()}
         try:
-            StateRenderer(index, index.image_size, fast).compare(state, images, "render these again")
+            for size in {*index.image_shapes}:
+                stored = {camera: image for camera, image in images.items() if image.shape[:2] == size}
+                StateRenderer(index, size, fast).compare(state, stored, "render these again")
             return
         except ImportError as error:  # policies are often trained where nothing renders
             why = str(error)

@@ -16,6 +16,7 @@ from torch import Tensor
 from warmprior.checks import check_choice, check_distinct, check_whole_numbers
 from warmprior.envs.env_args import declared_actions
 from warmprior.envs.tasks import TaskSpec
+from warmprior.modules.resize import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
 MISFIT = "They do not fit these actions: correct one or the other."
@@ -47,7 +48,9 @@ class DatasetIndex:
         path: the file or folder.
         demos: names of the selected demos, in the order of their numbers.
         observation_keys: the observations to read, in the order of concatenation.
-        image_size: side of the images to read in pixels; 0 if there are none.
+        image_shapes: heights and widths of the images to read, as they are stored.
+        image_size: side in pixels to which these are resized; 0 if there are none.
+        resize: how they are resized, see :func:`~warmprior.modules.resize.resized`.
         available_keys: all observations.
         env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
@@ -61,7 +64,9 @@ class DatasetIndex:
     observation_keys: tuple[str, ...]
     observation_dims: tuple[int, ...]
     image_keys: tuple[str, ...] = ()
+    image_shapes: tuple[tuple[int, int], ...] = ()
     image_size: int = 0
+    resize: Resize = "squeeze"
     available_keys: tuple[str, ...]
     action_dim: int
     env_args: dict[str, Any] = field(default_factory=dict)
@@ -121,8 +126,8 @@ class DemonstrationReader(ABC):
         return None
 
     @abstractmethod
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
+    def images(self, demo: str, key: str) -> Iterator[Tensor]:
+        """Yield the images of a demo as they are stored, in blocks, uint8 ``[n, 3, h, w]``."""
 
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
@@ -168,13 +173,6 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
 def no_such(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetError:
     """Return the error for a name that is not among those of its kind."""
     return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(names) or 'none'}")
-
-
-def common_size(path: Path, sides: Mapping[int, str]) -> int:
-    """Return the common side of all images in pixels, 0 without images; raise DatasetError if they differ."""
-    if len(sides) > 1:
-        raise DatasetError(f"{path}: images must have one size, got {sides}: render them again")
-    return next(iter(sides), 0)
 
 
 def pose_keys(action_dim: int) -> list[str]:

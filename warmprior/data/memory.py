@@ -13,24 +13,33 @@ from torch import Tensor
 
 from warmprior.checks import check_keys
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.index import DatasetIndex
+from warmprior.data.index import BLOCK, DatasetIndex
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE
+from warmprior.modules.resize import Resize, resized
 
 
 def demonstrations_of(
-    steps: TensorDictBase, name: str = "demonstrations", *, style: str = "human", normalised: bool = False
+    steps: TensorDictBase,
+    name: str = "demonstrations",
+    *,
+    style: str = "human",
+    normalised: bool = False,
+    image_size: int | None = None,
+    resize: Resize = "squeeze",
 ) -> Demonstrations:
     """Return contiguous steps in memory as demonstrations, which a :class:`~warmprior.tasks.Task` takes.
 
     Args:
         steps: contiguous steps ``[N]``, with ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and
             ``"episode"``, an integer ``[N]``. With images, ``"observation"`` has the entries ``"state"``
-            ``[N, d_o]`` and each image, uint8 ``[N, 3, size, size]``.
+            ``[N, d_o]`` and each image, uint8 ``[N, 3, h, w]``.
         name: short name of the task.
 
     Keyword Args:
         style: style of the demonstrations.
         normalised: True if the steps are in normalised units; otherwise a task fits a normaliser to them.
+        image_size: side to which images are resized, see :class:`Demonstrations`.
+        resize: how they are resized.
 
     Raises:
         KeyError: if the steps lack an entry.
@@ -45,33 +54,32 @@ def demonstrations_of(
         >>> demonstrations_of(TensorDict(steps, [60]), "pendulum").index().lengths
         (20, 20, 20)
     """
-    return _Steps(steps, name, style=style, normalised=normalised)
+    sized = {"image_size": image_size, "resize": resize}
+    return _Steps(steps, name, style=style, normalised=normalised, **sized)
 
 
 class _Steps(Demonstrations):
     prefix = ""
 
-    def __init__(self, steps: TensorDictBase, name: str, *, style: str, normalised: bool) -> None:
-        super().__init__(name, style=style)
+    def __init__(self, steps: TensorDictBase, name: str, *, normalised: bool, **options: Any) -> None:
+        super().__init__(name, **options)
         self.normalised = normalised  # type: ignore[misc]
         if steps.ndim != 1:
             raise ValueError(f"the demonstrations of {name} must be flat steps [N], got {tuple(steps.shape)}")
         needed = (OBSERVATION, ACTION, EPISODE)
         check_keys(steps, needed, f"the demonstrations of {name}", f": they have {list(steps.keys())}")
         vector: NestedKey = OBSERVATION
-        self._images: dict[str, int] = {}
+        self._images: dict[str, tuple[int, int]] = {}
         if isinstance(steps[OBSERVATION], TensorDictBase):
             vector = (OBSERVATION, STATE)
             check_keys(steps, [vector], f"the demonstrations of {name}", ", the robot's state next to images")
-            sizes: set[int] = set()
             for key, image in steps[OBSERVATION].exclude(STATE).items():
-                sizes.update(image.shape[2:])
-                if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3 or len(sizes) > 1:
+                if image.dtype != torch.uint8 or image.ndim != 4 or image.shape[1] != 3 or not image.numel():
                     raise ValueError(
                         f"{key!r} of {name} has shape {tuple(image.shape)} of {image.dtype}, but images must "
-                        "be uint8 [N, 3, size, size], of one size for all cameras: crop or resize them"
+                        "be uint8 [N, 3, h, w]"
                     )
-                self._images[key] = image.shape[-1]
+                self._images[key] = image.shape[-2:]
         for key, shape in ((vector, "[N, d]"), (ACTION, "[N, d]"), (EPISODE, "[N]")):
             value = steps[key]
             found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else "text"
@@ -106,12 +114,16 @@ class _Steps(Demonstrations):
             lengths=tuple(lengths.tolist()),
             observation_keys=(OBSERVATION,),
             observation_dims=(self._values[self._vector].shape[-1],),
-            image_keys=tuple(self._images),
-            image_size=next(iter(self._images.values()), 0),
+            **self.pictured(list(self._images), self._images),
             available_keys=(OBSERVATION, *self._images),
             action_dim=self._values[ACTION].shape[-1],
         )
 
     @override
     def steps(self, *_: Any, **__: Any) -> TensorDictBase:
-        return self._values
+        index, values = self.index(), self._values.clone(False)
+        for key in index.image_keys:
+            size, blocks = (index.image_size,) * 2, values[OBSERVATION, key].split(BLOCK)
+            if self._images[key] != size:
+                values[OBSERVATION, key] = torch.cat([resized(block, size, self.resize) for block in blocks])
+        return values

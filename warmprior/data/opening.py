@@ -41,8 +41,9 @@ def open_demonstrations(
             ``"human"`` outside robosuite.
         task: the task of robosuite, or its ``env_args``, for a LeRobotDataset that does not describe its
             environment.
-        options: options of the format: of a LeRobotDataset ``episodes``, the numbers of the episodes to read
-            (files of others are not needed), and ``revision``, a branch, tag or commit of a repository.
+        options: ``image_size`` and ``resize`` of images, see :class:`Demonstrations`; and options of the
+            format: of a LeRobotDataset ``episodes``, the numbers of the episodes to read (files of others are
+            not needed), and ``revision``, a branch, tag or commit of a repository.
 
     Examples:
         >>> from warmprior.data import open_demonstrations

@@ -33,6 +33,7 @@ from warmprior.envs.env_args import delta_conventions
 from warmprior.io.machine import available_memory
 from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
+from warmprior.modules.resize import resized
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
 Storage = Literal["memory", "memmap"]
@@ -268,7 +269,16 @@ def _fill(
         read_actions(demo, action[start:stop])
         reader.numbers(demo, "rewards", reward[start:stop])
         for key in index.image_keys:
-            reader.images(demo, key, data[OBSERVATION, key][start:stop])
+            images, first = data[OBSERVATION, key], start
+            for block in reader.images(demo, key):
+                part = images[first : first + len(block)]
+                part.copy_(resized(block, (index.image_size,) * 2, index.resize)[: len(part)])
+                first += len(block)
+            if first != stop:
+                raise DatasetError(
+                    f"{index.path}: demo {demo} has {first - start} images {key} for {stop - start} steps: "
+                    "record it again or leave it out"
+                )
         data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)

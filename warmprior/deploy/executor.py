@@ -28,7 +28,7 @@ from warmprior.checks import (
     check_whole_numbers,
     given,
 )
-from warmprior.deploy.observation import RobotObservation, observation_shapes
+from warmprior.deploy.observation import RobotObservation, encoder_in, observation_shapes
 from warmprior.history import caught_up, cold_history
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
@@ -55,8 +55,8 @@ class AsyncExecutor:
     Several threads can share an executor: their calls take turns.
 
     The normaliser, the number of stacked observations, and the observations' names and sizes come from the
-    policy. Camera images may have any size: they are resized to the size of the training images, and the
-    encoder takes the central crop.
+    policy. Camera images may have any size: they are resized as those of the training were, and the encoder
+    takes the central crop.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, an :class:`ExportedPolicy`, a
@@ -145,7 +145,11 @@ class AsyncExecutor:
         self._reach = getattr(guidance, "horizon", None) or length
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._postprocess = getattr(plain, "postprocess", None)
-        self._observed = RobotObservation(observation_shapes(actor, prior), self._normalizer)
+        self._observed = RobotObservation(
+            observation_shapes(actor, prior),
+            self._normalizer,
+            getattr(encoder_in(actor), "resize", "squeeze"),
+        )
         self._sees_history = keys.CONDITIONED in actor.in_keys
         self._owned = None
         if pool is None and latency is None:

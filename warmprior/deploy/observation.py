@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from warmprior import keys
 from warmprior.checks import check_keys, check_shape
@@ -17,7 +16,15 @@ from warmprior.modules.encoder import ImageEncoder
 from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
+from warmprior.modules.resize import Resize, resized
 from warmprior.transforms.history import HistoryObservation
+
+
+def encoder_in(actor: Any) -> ImageEncoder | None:
+    """Return the image encoder of a policy's network, if it has one."""
+    network = uncompiled(getattr(uncompiled(actor), "network", None))
+    modules = network.modules() if isinstance(network, torch.nn.Module) else ()
+    return next((part for part in modules if isinstance(part, ImageEncoder)), None)
 
 
 def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, tuple[int, ...]] | None:
@@ -33,7 +40,7 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
     network = uncompiled(getattr(plain, "network", None))
     if (shapes := getattr(plain, "shapes", None)) is not None or not isinstance(network, VelocityNetwork):
         return shapes
-    encoder = next((part for part in network.modules() if isinstance(part, ImageEncoder)), None)
+    encoder = encoder_in(actor)
     if encoder is None and network.encodes:  # a user's own encoder may have no shapes
         return None
     shapes = {keys.STATE: (network.observation_dim,)} if encoder is None else {**encoder.shapes}
@@ -50,13 +57,19 @@ class RobotObservation:
     Args:
         shapes: see :func:`observation_shapes`; with ``None`` observations are only copied.
         normalizer: normaliser of vectors.
+        resize: how images are resized, see :func:`~warmprior.modules.resize.resized`.
 
     Raises:
         ValueError: if the normaliser lacks a vector.
     """
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]] | None, normalizer: Normalizer | None) -> None:
-        self.shapes, self.normalizer = shapes, normalizer
+    def __init__(
+        self,
+        shapes: Mapping[str, tuple[int, ...]] | None,
+        normalizer: Normalizer | None,
+        resize: Resize = "squeeze",
+    ) -> None:
+        self.shapes, self.normalizer, self.resize = shapes, normalizer, resize
         # A policy with a single vector takes it without a name.
         self._vector = shapes is not None and [len(shape) for shape in shapes.values()] == [1]
         if normalizer is None or shapes is None:
@@ -93,7 +106,9 @@ class RobotObservation:
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
         given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
         check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
-        entries = {name: _fitted(name, given[name], shape) for name, shape in self.shapes.items()}
+        entries = {
+            name: _fitted(name, given[name], shape, self.resize) for name, shape in self.shapes.items()
+        }
         return next(iter(entries.values())) if self._vector else TensorDict(entries)
 
 
@@ -108,8 +123,8 @@ def _copied(name: str, value: Any) -> Tensor:
         raise ValueError(f"{name!r} is not an array of numbers: {error}") from error
 
 
-def _fitted(name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
-    """Check a vector; put an image's channels first and resize it, as the LeRobot plugin does."""
+def _fitted(name: str, value: Any, shape: tuple[int, ...], resize: Resize) -> Tensor:
+    """Check a vector; put an image's channels first and resize it."""
     array = _copied(name, value)
     if len(shape) != 3:
         check_shape(name, array, shape)
@@ -120,6 +135,4 @@ def _fitted(name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
             f"{name!r} is not an image: it has shape {list(array.shape)} of {array.dtype}, but a camera "
             "gives uint8 [h, w, 3] or [3, h, w]"
         )
-    if image.shape == shape:
-        return image
-    return interpolate(image[None], shape[1:], mode="bilinear", antialias=True)[0]
+    return resized(image, (shape[1], shape[2]), resize)

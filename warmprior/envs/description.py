@@ -20,7 +20,7 @@ from warmprior.transforms.absolute_actions import AbsoluteActions, Actions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
-_IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
+_IMAGES = ("cameras", "size", "rendered", "resize", "fast_rendering", "low_dim_keys")
 
 
 def environment_description(
@@ -41,9 +41,9 @@ def environment_description(
         style: see :class:`RobosuiteEnv`.
         actions: the policy's actions: the environment's own pose deltas, or absolute poses (see
             :class:`~warmprior.transforms.AbsoluteActions`).
-        images: options of a policy's images, if it sees any: ``"cameras"`` and ``"size"``, see
-            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, its
-            other observations, see :class:`RobosuiteEnv`.
+        images: options of a policy's images, if it sees any: ``"cameras"``, ``"size"``, ``"rendered"`` and
+            ``"resize"``, see :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and
+            ``"low_dim_keys"``, its other observations, see :class:`RobosuiteEnv`.
 
     Keyword Args:
         low_dim_keys: observations of a policy without images, if they differ from the task's.
@@ -80,7 +80,8 @@ def robosuite_parts(
     if images is not None:
         options["sim_state"] = True
         options |= {name: images[name] for name in ("low_dim_keys", "fast_rendering")}
-        transforms["images"] = CameraImages(images["cameras"], images["size"])
+        sizes = {name: images[name] for name in ("size", "rendered", "resize")}
+        transforms["images"] = CameraImages(images["cameras"], **sizes)
     return partial(RobosuiteEnv, **options), transforms
 
 

@@ -26,6 +26,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config, kept_arguments
+from warmprior.modules.resize import IMAGE_SIZE, Resize
 
 Backbone = Literal["resnet18", "small"]
 
@@ -34,6 +35,9 @@ _CHANNEL_DEVIATION = (0.229, 0.224, 0.225)
 """The statistics of ImageNet's pixels in [0, 1], which its weights expect."""
 
 _SMALL_FEATURES = 64
+
+_CROPPED = 76 / IMAGE_SIZE
+"""The share of an image's side that its crop has in the paper (Table 3)."""
 
 
 def _resnet18() -> tuple[nn.Module, int]:
@@ -66,9 +70,11 @@ class ImageEncoder(nn.Module):
         cameras: names of the images in the observation.
         state_dim: width of the observation's vector ``"state"``; 0 if there is none.
         image_size: side of the images in pixels.
-        crop_size: side of the crop in pixels.
+        crop_size: side of the crop in pixels; by default 76 of 84, in proportion.
         backbone: ``"resnet18"``, or ``"small"``: three convolutions and a linear layer, for small budgets.
         share: True uses one network for all cameras.
+        resize: how cameras' images of another size were resized, and are on a robot, see
+            :func:`~warmprior.modules.resize.resized`.
 
     Raises:
         ValueError: if there are no cameras, one is named twice, or an option is out of range.
@@ -90,20 +96,23 @@ class ImageEncoder(nn.Module):
         cameras: Sequence[str],
         state_dim: int,
         *,
-        image_size: int = 84,
-        crop_size: int = 76,
+        image_size: int = IMAGE_SIZE,
+        crop_size: int | None = None,
         backbone: Backbone = "resnet18",
         share: bool = False,
+        resize: Resize = "squeeze",
     ) -> None:
         super().__init__()
         cameras = tuple(cameras)
         check_distinct("cameras of an image encoder", cameras)
         check_whole_numbers(0, state_dim=state_dim)
+        crop_size = round(_CROPPED * image_size) if crop_size is None else crop_size
         check_between(8, image_size, crop_size=crop_size)
         check_choice("backbone", backbone, get_args(Backbone))
+        check_choice("resize", resize, get_args(Resize))
         self.cameras, self.state_dim = cameras, state_dim
         self.image_size, self.crop_size = image_size, crop_size
-        self.backbone, self.share = backbone, share
+        self.backbone, self.share, self.resize = backbone, share, resize
         made = [
             _resnet18() if backbone == "resnet18" else _small(crop_size)
             for _ in (cameras[:1] if share else cameras)

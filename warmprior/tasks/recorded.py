@@ -80,6 +80,8 @@ def _robosuite(
         pictured = {
             "cameras": [key.removesuffix("_image") for key in index.image_keys],
             "size": index.image_size,
+            "rendered": [list(shape) for shape in index.image_shapes],
+            "resize": index.resize,
             "fast_rendering": play.fast_rendering,
             "low_dim_keys": list(index.observation_keys),
         }

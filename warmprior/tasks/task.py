@@ -106,6 +106,7 @@ class Task:
         adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
         rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
+        resize: how the images were resized, see :func:`~warmprior.modules.resize.resized`.
         clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for no bound.
         environment: the description of the environment that a saved policy keeps, see
             :func:`~warmprior.envs.environment_of`; ``None`` if it is not a recorded one.
@@ -181,6 +182,7 @@ class Task:
             storage="memmap" if index.image_keys else "memory",
         )
         vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
+        self.resize = index.resize
         self.name = demonstrations.title if recorded is None else recorded.name
         self.style = (demonstrations.style or "human") if recorded is None else recorded.style
         for part in (self.name, self.style):
@@ -312,13 +314,17 @@ class Task:
         numbers = episode.unique()
         if held_out >= len(numbers):
             raise ValueError(f"held_out={held_out} of {len(numbers)} demonstrations leaves none to train on")
-        kept = torch.isin(episode, numbers[:-held_out])
+        mask = torch.isin(episode, numbers[:-held_out])
+        kept: Any = mask
+        left_out: Any = ~mask
+        if mask[: (first := int(mask.sum()))].all():  # views, so that images stay on the disk
+            kept, left_out = slice(first), slice(first, None)
         part = copy.copy(self)
         part.__dict__.pop("identity", None)
         part.data = self.data[kept]
         part.facts = self.facts | {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
         part.digest = None if self.digest is None else digest_of(self.digest, held_out)
-        return part, self.data[~kept]
+        return part, self.data[left_out]
 
     @cached_property
     def identity(self) -> str:

@@ -27,6 +27,7 @@ from warmprior.modules import (
 )
 from warmprior.modules.encoder import load_imagenet
 from warmprior.modules.preconditioning import Slope
+from warmprior.modules.resize import Resize
 from warmprior.objectives.flow_matching import Objective, Weighting
 from warmprior.objectives.times import TimesName
 
@@ -63,7 +64,8 @@ class NetworkOptions:
             by default.
         encoder: image encoder, one network per camera: ResNet-18 with ImageNet's weights, which torchvision
             downloads once, ResNet-18 with random weights, or a small network.
-        crop_size: side of the crop of an image in pixels: random in training, central otherwise.
+        crop_size: side of the crop of an image in pixels, random in training, central otherwise; by default
+            76 of 84, in proportion.
         share_encoder: use one encoder for all cameras.
 
     Examples:
@@ -83,12 +85,12 @@ class NetworkOptions:
     observation_layers: int | None = None
     time_frequency: float | None = None
     encoder: Encoder = "resnet18-imagenet"
-    crop_size: int = 76
+    crop_size: int | None = None
     share_encoder: bool = False
 
     def __post_init__(self) -> None:
-        check_whole_numbers(observation_steps=self.observation_steps, crop_size=self.crop_size)
-        check_whole_numbers(**given(hidden_dim=self.hidden_dim))
+        check_whole_numbers(observation_steps=self.observation_steps)
+        check_whole_numbers(**given(hidden_dim=self.hidden_dim, crop_size=self.crop_size))
         check_choice("network", self.network, _NETWORKS)
         check_choice("encoder", self.encoder, get_args(Encoder))
         check_choice("slope", self.slope, get_args(Slope))
@@ -112,10 +114,12 @@ class NetworkOptions:
         observation_dim: int,
         prediction_length: int,
         images: Mapping[str, int] | None = None,
+        resize: Resize = "squeeze",
     ) -> VelocityNetwork:
         """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
-        With images, ``d_o`` is the width of the vector. Raises ValueError for options of images without any.
+        With images, ``d_o`` is the width of the vector, and ``resize`` how the images got their size. Raises
+        ValueError for options of images without any.
         """
         kind, width = _NETWORKS[self.network]
         options = self._of_transformers()
@@ -133,6 +137,7 @@ class NetworkOptions:
                 crop_size=self.crop_size,
                 backbone="small" if self.encoder == "small" else "resnet18",
                 share=self.share_encoder,
+                resize=resize,
             )
             if self.encoder == PRETRAINED:
                 load_imagenet(encoder)

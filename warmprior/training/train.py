@@ -53,7 +53,7 @@ def new_policy(
     if see_history:
         observation_dim += HistoryObservation.width(prior.history_length, action_dim)
     torch.manual_seed(training.seed)
-    velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images)
+    velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images, task.resize)
     if network.precondition:
         velocity = precondition(
             velocity,

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
@@ -15,6 +14,7 @@ from warmprior import keys
 from warmprior.checks import check_distinct, check_keys, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation, precision_of
+from warmprior.modules.resize import IMAGE_SIZE, Resize, resized
 from warmprior.transforms.inner_step import EnvTransform
 
 _SIM_STATE = ": build the environment with sim_state=True"
@@ -32,6 +32,11 @@ class CameraImages(EnvTransform):
         cameras: names of the simulator's cameras; the image of ``"agentview"`` becomes
             ``("observation", "agentview_image")``, uint8 ``[3, size, size]``.
         size: side of the images in pixels.
+
+    Keyword Args:
+        rendered: heights and widths at which the cameras are rendered, before their images are resized; by
+            default ``size``.
+        resize: see :func:`~warmprior.modules.resize.resized`.
 
     Raises:
         ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
@@ -51,12 +56,20 @@ class CameraImages(EnvTransform):
         ValueError: cameras of CameraImages must be different names, got ['agentview', 'agentview']
     """
 
-    def __init__(self, cameras: Sequence[str], size: int = 84) -> None:
+    def __init__(
+        self,
+        cameras: Sequence[str],
+        size: int = IMAGE_SIZE,
+        *,
+        rendered: Sequence[Sequence[int]] | None = None,
+        resize: Resize = "squeeze",
+    ) -> None:
         super().__init__(in_keys=[keys.OBSERVATION, keys.SIM_STATE], out_keys=[keys.OBSERVATION])
         self.cameras = tuple(cameras)
         check_distinct("cameras of CameraImages", self.cameras)
         check_whole_numbers(size=size)
-        self.size = size
+        self.size, self.resize = size, resize
+        self.rendered = [(size, size)] * len(self.cameras) if rendered is None else list(map(tuple, rendered))
 
     @property
     def _simulator(self) -> Any:
@@ -73,9 +86,10 @@ class CameraImages(EnvTransform):
         simulator, numbers = self._simulator, next_tensordict.get(keys.SIM_STATE).cpu().numpy()
         vector = next_tensordict.get(keys.OBSERVATION)
         entries = {keys.STATE: vector}
-        for camera in self.cameras:
-            image = simulator.render_frame(camera, self.size, numbers).transpose(2, 0, 1)
-            entries[f"{camera}_image"] = torch.from_numpy(np.ascontiguousarray(image)).to(vector.device)
+        for camera, shape in zip(self.cameras, self.rendered, strict=True):
+            image = torch.from_numpy(simulator.render_frame(camera, shape, numbers)).permute(2, 0, 1)
+            image = resized(image, (self.size, self.size), self.resize)
+            entries[f"{camera}_image"] = image.contiguous().to(vector.device)
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -18,6 +18,7 @@ from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
+from warmprior.modules.resize import IMAGE_SIZE
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 
@@ -62,7 +63,9 @@ class WarmFlowConfig(PreTrainedConfig):
         encoder: image encoder, one per camera: ``resnet18-imagenet`` starts from ImageNet's weights, which
             torchvision downloads once; ``resnet18`` and ``small`` start from random ones.
         image_size: side in pixels to which images are resized.
-        crop_size: side in pixels of the crop, which is random in training and central at decisions.
+        resize: how images become square: `squeeze`, or `pad` with black.
+        crop_size: side in pixels of the crop, which is random in training and central at decisions; by
+            default 76 of 84, in proportion.
     """
 
     n_obs_steps: int = 2
@@ -80,8 +83,9 @@ class WarmFlowConfig(PreTrainedConfig):
     num_heads: int = 6
     dropout: float = 0.1
     encoder: str = "resnet18-imagenet"
-    image_size: int = 84
-    crop_size: int = 76
+    image_size: int = IMAGE_SIZE
+    resize: str = "squeeze"
+    crop_size: int | None = None
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "STATE": NormalizationMode.MIN_MAX,
@@ -109,7 +113,7 @@ class WarmFlowConfig(PreTrainedConfig):
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""
         names = ["n_obs_steps", "precondition", "joints", "network", "embedding_dim", "num_layers"]
-        names += ["num_heads", "image_size", "crop_size", "normalization_mapping"]
+        names += ["num_heads", "image_size", "resize", "crop_size", "normalization_mapping"]
         return {
             **{name: getattr(self, name) for name in names},
             "input_features": [*self.observed, *self.image_features],

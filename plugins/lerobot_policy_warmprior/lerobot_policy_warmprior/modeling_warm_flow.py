@@ -17,7 +17,6 @@ from lerobot.policies.utils import populate_queues
 from lerobot.processor import NormalizerProcessorStep, TransitionKey
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.nn.functional import interpolate
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
@@ -43,6 +42,7 @@ from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
+from warmprior.modules.resize import resized
 from warmprior.training import ema_of, precondition
 
 STATE = "observation.state"
@@ -111,6 +111,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 backbone=cast(Any, backbone),  # checked by the configuration
                 image_size=config.image_size,
                 crop_size=config.crop_size,
+                resize=cast(Any, config.resize),
             )
             # A saved policy's weights are in its file.
             if pretrained and dataset_meta is not None and not config.pretrained_path:
@@ -365,8 +366,5 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             raise ValueError(
                 f"warm_flow sees images as numbers in [0, 1], as LeRobot loads them, got {images.dtype}"
             )
-        side = self.config.image_size
-        flat = images.flatten(0, 1)
-        if flat.shape[-2:] != (side, side):
-            flat = interpolate(flat, (side, side), mode="bilinear", antialias=True)
-        return (255 * flat).round().clamp(0, 255).to(torch.uint8).unflatten(0, images.shape[:2])
+        pixels = (255 * images).round().clamp(0, 255).to(torch.uint8)
+        return resized(pixels, (self.config.image_size,) * 2, cast(Any, self.config.resize))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, override
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from warmprior.data import index as indices
@@ -26,7 +27,6 @@ from warmprior.data.index import (
     DemonstrationReader,
     check_count,
     check_env_args,
-    common_size,
     declared_poses,
     no_such,
     pose_keys,
@@ -262,9 +262,9 @@ def _is_vector(observations: h5py.Group, key: str) -> bool:
         )
 
 
-def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int, str]:
-    """Return the sides in pixels of a demo's images, after checking their shapes and types."""
-    sizes = {}
+def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str, tuple[int, int]]:
+    """Return heights and widths of a demo's images, after checking their shapes and types."""
+    shapes = {}
     for key in keys:
         what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
         if images is None:
@@ -276,12 +276,12 @@ def _image_sizes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int,
                 )
             raise no_such(_place(demo), "images", key, others)
         shape: tuple[int, ...] = images.shape or ()
-        side = shape[1] if len(shape) == 4 else 0
-        if images.dtype != "uint8" or shape != (steps, side, side, 3):
+        rows, *size, colours = shape if len(shape) == 4 else (0, 0, 0)
+        if images.dtype != "uint8" or (rows, colours) != (steps, 3) or not min(size):
             kind = f"shape {shape} and type {images.dtype}"
-            raise DatasetError(f"{what} has {kind}; images are uint8 ({steps}, side, side, 3)")
-        sizes[side] = what
-    return sizes
+            raise DatasetError(f"{what} has {kind}; images are uint8 ({steps}, height, width, 3)")
+        shapes[key] = (size[0], size[1])
+    return shapes
 
 
 class RobomimicReader(DemonstrationReader):
@@ -303,14 +303,15 @@ class RobomimicReader(DemonstrationReader):
                 block = dataset[first + start : first + start + len(rows)]
             store_finite(block, rows, what, _LEAVE_OUT, first + start)
 
-    def images(self, demo: str, key: str, out: Tensor) -> None:
+    def images(self, demo: str, key: str) -> Iterator[Tensor]:
         """Read block by block."""
-        name, target = f"data/{demo}/obs/{key}", out.numpy()
+        name = f"data/{demo}/obs/{key}"
         images: Any = member(self.file, name, "dataset")
-        rows = max(1, _IMAGE_BYTES // max(1, out[0].numel()))
-        for start in range(0, len(out), rows):
+        rows = max(1, _IMAGE_BYTES // prod(images.shape[1:]))
+        for start in range(0, len(images), rows):
             with reading(self.file, name):
-                target[start : start + rows] = images[start : start + rows].transpose(0, 3, 1, 2)
+                block = images[start : start + rows]
+            yield torch.from_numpy(block).permute(0, 3, 1, 2)
 
     def name(self, demo: str, key: str) -> str:
         """Return the name of a demo's array for errors."""
@@ -394,7 +395,7 @@ class RobomimicDemonstrations(Demonstrations):
                 if observations is None:
                     expected["obs/object"] = task.object_dim
             lengths: list[int] = []
-            sides: dict[int, str] = {}
+            shapes: dict[str, tuple[int, int]] = {}
             for name in selected:
                 demo = member(file["data"], name, "group")
                 if demo is None:  # the name is listed, but a damaged index hides the demo
@@ -413,7 +414,13 @@ class RobomimicDemonstrations(Demonstrations):
                         )
                 expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
                 lengths.append(steps)
-                sides = _image_sizes(demo, images, steps) | sides
+                sizes = _image_shapes(demo, images, steps)
+                if shapes and sizes != shapes:
+                    raise DatasetError(
+                        f"{_place(demo)} has images of {sizes}, and data/{selected[0]} of {shapes}: render "
+                        "them again, or leave the demo out"
+                    )
+                shapes = sizes
             if self.mask is None and self.demos is None:
                 _check_total(file, sum(lengths))
         return DatasetIndex(
@@ -422,8 +429,7 @@ class RobomimicDemonstrations(Demonstrations):
             lengths=tuple(lengths),
             observation_keys=keys,
             observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
-            image_keys=tuple(images),
-            image_size=common_size(path, sides),
+            **self.pictured(images, shapes),
             available_keys=available,
             action_dim=widths["actions"],
             env_args=env_args,

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any, override
 
@@ -105,19 +106,20 @@ class LeRobotReader(DemonstrationReader):
         inside = f" ({observation})" if key != observation != feature else ""
         return f"{self.index.path / file}: {feature}{inside} of episode {demo}"
 
-    def images(self, demo: str, key: str, out: Tensor) -> None:
+    def images(self, demo: str, key: str) -> Iterator[Tensor]:
         """Decode frames in parts."""
         episode, feature = self._episodes[demo], self.index.images[key]
         video = feature if feature in self.index.videos else None
         path = self.index.path / episode_file(self.index.metadata, episode, video)
-        step = max(1, DECODED // max(1, out[0].numel()))
+        shape = (3, *self.index.image_shapes[self.index.image_keys.index(key)])
+        length, step = episode["length"], max(1, DECODED // prod(shape))
         with reading(f"{path}", _AGAIN):
             frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
-            for first in range(0, len(out), step):
-                part = out[first : first + step]
-                decoded = frames(first, first + len(part))
-                check_shape(f"{feature} of episode {demo}", decoded, part.shape)
-                part.copy_(decoded)
+            for first in range(0, length, step):
+                stop = min(first + step, length)
+                decoded = frames(first, stop)
+                check_shape(f"{feature} of episode {demo}", decoded, (stop - first, *shape))
+                yield decoded
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
         decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames

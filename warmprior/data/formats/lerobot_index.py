@@ -15,7 +15,6 @@ from warmprior.data.index import (
     DatasetIndex,
     check_count,
     check_env_args,
-    common_size,
     declared_poses,
     no_such,
     pose_keys,
@@ -302,8 +301,9 @@ def read_lerobot_index(
         lengths=tuple(row["length"] for row in rows),
         observation_keys=tuple(observations),
         observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observations),
-        image_keys=tuple(images),
-        image_size=_image_size(root, metadata.features, cameras, images),
+        **demonstrations.pictured(
+            images, {key: _image_shape(root, metadata.features, cameras, key) for key in images}
+        ),
         available_keys=(*columns, *cameras),
         action_dim=widths["action"],
         env_args=recorded,
@@ -416,17 +416,15 @@ def _named_columns(
     return {key: columns[key] for key in task.low_dim_widths}
 
 
-def _image_size(
-    root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], keys: Sequence[str]
-) -> int:
-    """Return the side of the images to read, in pixels, or 0 if there are none."""
-    sizes = {}
-    for key in keys:
-        if key not in cameras:
-            raise no_such(root, "images", key, cameras)
-        shape = tuple(features[cameras[key]]["shape"])
-        side = max(shape)
-        if shape not in ((side, side, 3), (3, side, side)):
-            raise DatasetError(f"{root}: {cameras[key]!r} has shape {shape}: resize images to be square")
-        sizes[side] = cameras[key]
-    return common_size(root, sizes)
+def _image_shape(
+    root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], key: str
+) -> tuple[int, int]:
+    """Return height and width of an image as it is stored."""
+    if key not in cameras:
+        raise no_such(root, "images", key, cameras)
+    match features[cameras[key]]["shape"]:
+        case (3, height, width) | (height, width, 3) if min(height, width) > 0:
+            return height, width
+        case shape:
+            kind = f"{cameras[key]!r} has shape {tuple(shape)}"
+            raise DatasetError(f"{root}: {kind}, but images have height, width and 3 colours: leave it out")

@@ -19,7 +19,6 @@ from warmprior.data.index import (
     DatasetIndex,
     DemonstrationReader,
     check_count,
-    common_size,
     no_such,
     reading,
     store_finite,
@@ -71,7 +70,7 @@ def _is_vector(space: Any) -> bool:
 
 def _is_picture(space: Any) -> bool:
     shape: tuple[int, ...] = space.shape or ()
-    return len(shape) == 3 and shape[0] == shape[1] and shape[2] == 3 and space.dtype == np.uint8
+    return len(shape) == 3 and min(shape) > 0 and shape[2] == 3 and space.dtype == np.uint8
 
 
 class MinariReader(DemonstrationReader):
@@ -110,9 +109,8 @@ class MinariReader(DemonstrationReader):
         return bool(self._values(demo, "terminations")[-1])
 
     @override
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        frames = torch.from_numpy(self._values(demo, f"obs/{key}")[: len(out)])
-        out.copy_(frames.permute(0, 3, 1, 2))
+    def images(self, demo: str, key: str) -> Iterator[Tensor]:
+        yield torch.from_numpy(self._values(demo, f"obs/{key}")).permute(0, 3, 1, 2)
 
     @override
     def name(self, demo: str, key: str) -> str:
@@ -124,7 +122,7 @@ class MinariDemonstrations(Demonstrations):
 
     A dataset that is not in Minari's folder (``MINARI_DATASETS_PATH``) is downloaded. Observations are by
     default all vectors; entries of dictionaries have the names ``"outer/inner"``. An observation that follows
-    the last action of an episode is left out. Images must be square.
+    the last action of an episode is left out.
     """
 
     prefix = "minari:"
@@ -157,7 +155,7 @@ class MinariDemonstrations(Demonstrations):
                 f"{where}: observations are {dataset.observation_space}, but a policy needs a vector, or a "
                 "dictionary with one: record them with gymnasium.wrappers.FlattenObservation"
             )
-        pictures = {key: space.shape for key, space in spaces.items() if _is_picture(space)}
+        pictures = {key: space.shape[:2] for key, space in spaces.items() if _is_picture(space)}
         chosen = tuple(vectors if observations is None else observations)
         for kind, wanted, present in (("observation", chosen, vectors), ("image", images, pictures)):
             for key in wanted:
@@ -175,8 +173,7 @@ class MinariDemonstrations(Demonstrations):
             lengths=tuple(steps),
             observation_keys=chosen,
             observation_dims=tuple(vectors[key] for key in chosen),
-            image_keys=tuple(images),
-            image_size=common_size(where, {pictures[key][0]: key for key in images}),
+            **self.pictured(images, pictures),
             available_keys=(*vectors, *pictures),
             action_dim=action.shape[0],
             whole=self.demos in (None, dataset.total_episodes),
