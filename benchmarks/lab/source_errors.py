@@ -70,6 +70,43 @@ def mean_error(
     return MeanError(_rms((mean - target)[warm]), _rms((mean - chunk)[warm]))
 
 
+def error_by_position(
+    policy: WarmPriorActor, windows: TensorDictBase, *, nfe: int | None = None
+) -> tuple[list[float], list[float]]:
+    """Measure how far the source's mean, and the policy's chunk, are from the demonstrated actions.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: as of :func:`mean_error`.
+        nfe: network evaluations of the chunk; the policy's own by default.
+
+    Returns:
+        Two lists of root mean squares over windows and dimensions, one entry per executed position, in
+        normalised action units.
+
+    Examples:
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from lab.source_errors import error_by_position
+        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> [len(errors) for errors in error_by_position(untrained, shared.windows(untrained.prior), nfe=1)]
+        [4, 4]
+    """
+    flat, target, rows, generator = judged(policy, windows)
+    with evaluation_mode(policy):
+        nfe = policy.sampling.evaluations(nfe)
+        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
+    counted = flat["counted"].squeeze(-1)
+    executed = range(policy.prior.chunk_length)
+    mean, prediction = (
+        [_rms((actions - target)[:, k][counted[:, k]]) for k in executed]
+        for actions in (flat[keys.LOC], chunk)
+    )
+    return mean, prediction
+
+
 def mean_revision(rollout: TensorDictBase) -> float:
     """Measure the distance of the mean from the policy's next prediction, along rollouts.
 

@@ -18,9 +18,11 @@ SLOPES = {"marginal": "over all data", "conditional": "given the observation"}
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
 
-PLAYED = re.compile(r"(?<=<!-- )(rows|sigma|chunk|curvature|slope) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+PLAYED = re.compile(
+    r"(?<=<!-- )(rows|sigma|chunk|curvature|slope|forecasts) (\w+)( -->\n).*?(?=<!-- end -->)", re.S
+)
 """This matches the table of a run in a page: by NFE and noise, sigma, chunk length or
-slope, or of curvature."""
+slope, of curvature, or of forecasts' errors."""
 
 
 def played_table(name: str) -> str:
@@ -132,6 +134,18 @@ def curvature_table(name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def forecasts_table(name: str) -> str:
+    """Return errors of sources' means in Markdown, and of the chunks after them, by position and episodes."""
+    rows = read_json(DATA / f"{name}.jsonl", lines=True)
+    places = (0, 3, 7)
+    columns = [f"{what}, a<sub>{k + 1}</sub>" for what in ("mean", "chunk") for k in places]
+    text = [f"| | demonstrations | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
+    for _, row in rows[rows["nfe"] == 9].iterrows():
+        errors = [f"{row[what][k]:.2f}" for what in ("mean_error", "chunk_error") for k in places]
+        text.append(f"| {SOURCES[row['prior']][0]} | {row['demonstrations']} | {' | '.join(errors)} |")
+    return "\n".join(text) + "\n"
+
+
 def with_tables(page: str, tables: Sequence[str]) -> str:
     """Return a page with its tables, in their order, and those of the runs whose rows it names."""
     if len(places := TABLE.findall(page)) != len(tables):
@@ -141,6 +155,7 @@ def with_tables(page: str, tables: Sequence[str]) -> str:
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
         kinds = {"rows": played_table, "curvature": curvature_table, "slope": slope_table}
+        kinds |= {"forecasts": forecasts_table}
         drawn = kinds.get(kind, partial(study_table, kind))
         return f"{kind} {name}{end}{drawn(name)}"
 

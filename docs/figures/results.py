@@ -229,6 +229,7 @@ def tables() -> dict[Path, list[str]]:
     return {
         PAGE: [table(), sets_table()],
         DOCS / "notes" / "evidence.md": [lengths_table()],
+        DOCS / "notes" / "preview.md": [],
     }
 
 

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from lab.learned_sources import ForecastPrior
-from lab.source_errors import mean_error, mean_revision
+from lab.source_errors import error_by_position, mean_error, mean_revision
 from tests.diagnostics.fields import D_A, H, policy, remember, targets
 from warmprior import CVAEPrior, PastPrior, PreviewPrior
 
@@ -28,6 +28,17 @@ def test_only_warm_positions_inside_the_episode_count(prior):
     assert found.target == pytest.approx(math.sqrt(sum(squares) / len(squares)))
     # What does not move predicts mean and noise.
     assert found.revision == pytest.approx(prior.sigma, rel=0.3, abs=1e-7)
+
+
+def test_errors_by_position_leave_out_what_lies_behind_the_episode():
+    prior = PastPrior(H, sigma=0.0)
+    batch = windows(prior)
+    mean, chunk = error_by_position(policy(still, prior), batch, nfe=1)
+    difference = (batch["history", "forecast"] - batch["vla_action", "chunk"])[:, :H]
+    counted = ~batch["action_is_pad"][:, :H]
+    for k in range(H):
+        expected = float(difference[:, k][counted[:, k]].square().mean().sqrt())
+        assert mean[k] == chunk[k] == pytest.approx(expected)  # what does not move predicts the mean
 
 
 def test_the_mean_is_that_of_the_source():
