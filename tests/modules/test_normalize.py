@@ -76,6 +76,28 @@ def test_whole_numbers_and_flags_become_floats_in_a_batch_too(dtype):
         assert torch.equal(env.rollout(3)["observation"].reshape(-1, 2), expected)
 
 
+def test_an_environment_follows_statistics_that_are_loaded_later():
+    first, second = (
+        Normalizer({"observation": torch.zeros(4)}, {"observation": torch.full((4,), high)})
+        for high in (4.0, 8.0)
+    )
+    env = TransformedEnv(CountingEnv(5), Compose(*normalizing_transforms(first)))
+    torch.manual_seed(0)
+    raw = CountingEnv(5).rollout(3)
+    for loaded in (first, second):
+        first.load_state_dict(loaded.state_dict())
+        torch.manual_seed(0)  # the same actions
+        assert torch.equal(env.rollout(3)["observation"], loaded.normalize(raw)["observation"])
+
+
+def test_whole_numbers_are_no_actions_of_a_policy():
+    env = CountingEnv(5)
+    env.action_spec = Bounded(0, 9, (2,), dtype=torch.int64)
+    normalizer = Normalizer({"action": torch.zeros(2)}, {"action": torch.full((2,), 9.0)})
+    with raises(TypeError, "int64", "action", "rounds"):
+        TransformedEnv(env, *normalizing_transforms(normalizer)).action_spec  # noqa: B018
+
+
 def test_errors():
     raw = data()
     with raises(ValueError, "empty"):

@@ -43,14 +43,25 @@ class FloatScaling(ActionScaling):
         """Set the spec of the normalised action, which has the width of the statistics."""
         for key in self.in_keys_inv:
             if key in action_spec.keys(True, True):
-                check_width(key, action_spec[key].shape, self.loc)  # one number would fit any width
+                leaf = action_spec[key]
+                check_width(key, leaf.shape, self.loc)  # one number would fit any width
+                if not leaf.dtype.is_floating_point:
+                    raise TypeError(
+                        f"the environment takes {leaf.dtype} for {key}, and a policy writes real numbers: "
+                        "append a transform before the normaliser that rounds them"
+                    )
         return super().transform_action_spec(action_spec)
 
 
 def normalizing_transforms(normalizer: Normalizer, action_key: NestedKey = keys.ACTION) -> list[Transform]:
     """Return TorchRL transforms that (de)normalise directly after the base environment.
 
-    Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step.
+    Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step. They share the
+    normaliser's statistics, and follow it where others are loaded into it.
+
+    Raises:
+        TypeError: at the environment, if its actions are integers.
+        ValueError: at the environment, if its actions or observations have another width.
 
     Examples:
         >>> import torch
@@ -64,7 +75,7 @@ def normalizing_transforms(normalizer: Normalizer, action_key: NestedKey = keys.
     """
     transforms: list[Transform] = []
     for key in normalizer.keys:
-        loc, scale = normalizer.loc(key).clone(), normalizer.scale(key).clone()
+        loc, scale = normalizer.loc(key), normalizer.scale(key)
         if key == action_key:
             transforms.append(FloatScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
         else:
