@@ -53,8 +53,9 @@ def main(argv: list[str] | None) -> None:
             if not len(part):
                 continue
             data = policy.normalizer.normalize(steps[torch.isin(steps[EPISODE], part)])
-            prior, to = policy.prior, policy.network.observation_steps
-            shared = SharedObservations(data, prior.chunk_length, observation_steps=to)
+            network: Any = policy.network
+            prior, shape = policy.prior, {"observation_steps": network.observation_steps}
+            shared = SharedObservations(data, prior.chunk_length, **shape)
             generator = torch.Generator().manual_seed(0)
             order = torch.randperm(len(shared), generator=generator)[: args.windows]
             windows = shared.subset(order.sort()[0]).met(policy, generator=generator)
