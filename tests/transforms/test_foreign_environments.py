@@ -168,6 +168,19 @@ def test_single_steps_are_not_skipped():
         env.rollout(2, POLICY)
 
 
+@pytest.mark.parametrize("batch", [SerialEnv, None])
+def test_single_steps_are_not_skipped_inside_of_workers_either(batch):
+    def skipping():
+        skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
+        return TransformedEnv(CountingEnv(9), skip, auto_unwrap=False)
+
+    base = skipping() if batch is None else batch(2, skipping)
+    env = TransformedEnv(base, Compose(*policy_transforms(PRIOR)), auto_unwrap=False)
+    with raises(RuntimeError, "ConditionalSkip"):
+        env.rollout(2, POLICY)
+    env.close()
+
+
 class Instructed(CountingEnv):
     """Says what to do in words, beside the observation."""
 

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import (
     ActionDiscretizer,
     ActionScaling,
@@ -57,6 +58,14 @@ _REFUSED: dict[type[Transform], str] = {
     ActionDiscretizer: "whose actions are indices, and those of chunks numbers: leave it out",
     ConditionalSkip: "which skips single steps of a chunk: append it after, where it skips decisions",
 }
+
+
+def _descriptions(env: EnvBase) -> list[str]:
+    """Return what an environment says of itself; of workers in other processes nothing else is known."""
+    if not isinstance(env, BatchedEnvBase):
+        return [repr(env)]
+    workers = env.meta_data if isinstance(env.meta_data, list) else [env.meta_data]
+    return [worker.env_str for worker in workers]
 
 
 class LateTransforms:
@@ -282,9 +291,10 @@ class ChunkStep(EnvTransform):
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
-            for transform in inner.transforms:
-                if why := _REFUSED.get(type(transform)):
-                    raise RuntimeError(f"ChunkStep cannot come after {type(transform).__name__}, {why}")
+            below = [f"{type(transform).__name__}(" for transform in inner.transforms]
+            for refused, why in _REFUSED.items():
+                if any(f"{refused.__name__}(" in text for text in (*below, *_descriptions(inner.base))):
+                    raise RuntimeError(f"ChunkStep cannot come after {refused.__name__}, {why}")
             self._check_shapes(inner.base, parent)
             self._check_later()
             late = LateTransforms.of(inner, read, self.in_keys_inv)
