@@ -1,4 +1,5 @@
 import json
+import resource
 import sys
 
 import pytest
@@ -53,6 +54,27 @@ def test_weights_that_do_not_fit_are_refused_by_name(found, name, how, tmp_path)
     fact = misfit(tmp_path, how)
     with raises((ValueError, FileNotFoundError), fact, tmp_path):
         load(found, name, tmp_path)
+
+
+def test_damaged_weights_are_named(found, tmp_path):
+    made(found, "warm_flow").save_pretrained(tmp_path)
+    file = tmp_path / "model.safetensors"
+    content = bytearray(file.read_bytes())
+    content[0] ^= 0xFF  # the length of the header
+    file.write_bytes(content)
+    with raises(ValueError, file, "damaged"):
+        load(found, "warm_flow", tmp_path)
+
+
+def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, tmp_path):
+    made(found, "warm_flow").save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    for width in (24_000, 960_000):  # gigabytes, and terabytes
+        (tmp_path / "config.json").write_text(json.dumps(config | {"embedding_dim": width, "network": ""}))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        with raises(ValueError, tmp_path, "far more weights"):
+            load(found, "warm_flow", tmp_path)
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 
 def test_buffers_of_normalisation_of_old_checkpoints(found, tmp_path):

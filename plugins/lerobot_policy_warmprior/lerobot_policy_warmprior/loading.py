@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import torch
 from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from warmprior.io.files import read_json
@@ -30,14 +33,37 @@ STATISTICS = {
 """Statistics that LeRobot's normalisation needs; without them it silently does nothing."""
 
 
-def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
-    """Return the content of a JSON file in a folder or hub repository, empty if there is none."""
+def saved_file(place: str, name: str, **hub: Any) -> Path | None:
+    """Return a file in a folder or hub repository, if there is one."""
     folder = Path(place)
     try:
         file = folder / name if folder.is_dir() else Path(hf_hub_download(place, name, **hub))
     except EntryNotFoundError:
+        return None
+    return file if file.exists() else None
+
+
+def saved_weights(place: str, **hub: Any) -> dict[str, Tensor]:
+    """Return a policy's saved weights as tensors that take no memory, none if there is no file.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    file = saved_file(place, "model.safetensors", **hub)
+    if file is None:
         return {}
-    if not file.exists():
+    try:
+        with safe_open(file, "pt") as weights:
+            shapes = {name: weights.get_slice(name).get_shape() for name in weights.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{file} is damaged ({error}): copy or download the policy again") from None
+    return {name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
+
+
+def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
+    """Return the content of a JSON file in a folder or hub repository, empty if there is none."""
+    file = saved_file(place, name, **hub)
+    if file is None:
         return {}
     content = read_json(file)
     if not isinstance(content, dict):
@@ -66,6 +92,11 @@ class WholePolicy(nn.Module):
     config_class: Any
     name: str
     _misfit: ClassVar[str | None] = "no model.safetensors"
+
+    @classmethod
+    def limited_to(cls, weights: Mapping[str, Tensor]) -> AbstractContextManager[Any]:
+        """Return the context in which a policy with these saved weights is built; here without a limit."""
+        return nullcontext()
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and note those that do not fit."""
@@ -99,12 +130,13 @@ class WholePolicy(nn.Module):
         """Load a saved policy, or a checkpoint of its family.
 
         Raises:
-            ValueError: if weights are missing, unexpected or of another shape, or an option contradicts the
-                saved options.
+            ValueError: if weights are damaged, missing, unexpected or of another shape, or an option
+                contradicts the saved options.
             FileNotFoundError: if there is no such policy.
         """
         place = str(pretrained_name_or_path)
         hub = {name: kwargs[name] for name in HUB if name in kwargs}
+        weights = saved_weights(place, **hub)
         saved = saved_json(place, "config.json", **hub)
         if config is None:
             config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
@@ -115,7 +147,8 @@ class WholePolicy(nn.Module):
             check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
         misfit: str | None
         try:
-            policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
+            with cls.limited_to(weights):
+                policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
             misfit = policy._misfit
         except RuntimeError as error:
             if "state_dict" not in str(error):
@@ -123,6 +156,8 @@ class WholePolicy(nn.Module):
             misfit = str(error)  # it names the weights
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{place} has no policy: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"the policy in {place} cannot be built: {error}") from error
         if misfit == WholePolicy._misfit:
             raise FileNotFoundError(f"{place} has no model.safetensors: choose the folder of a saved policy")
         if misfit:

@@ -7,6 +7,7 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, cast
 
 import torch
@@ -43,6 +44,7 @@ from warmprior.lerobot.memory import ActionMemory
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.modules.resize import resized
+from warmprior.saving.policies import NoLargerThan
 from warmprior.training import ema_of, precondition
 
 STATE = "observation.state"
@@ -235,6 +237,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 )
         config.joints = ""
         return None
+
+    @classmethod
+    def limited_to(cls, weights: Mapping[str, Tensor]) -> AbstractContextManager[Any]:
+        """Refuse to build a network for which the saved weights are far too few."""
+        return NoLargerThan(weights) if weights else nullcontext()
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and keep moments that were fitted to the training data."""
