@@ -10,7 +10,7 @@ from tensordict import NonTensorStack, TensorDict
 from torchrl.envs import RenameTransform, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
+from lab.demonstrations.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.rl.test_images import CameraEnv
