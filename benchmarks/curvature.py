@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
+from lab.measures.straightness import RATIOS, check_flows, straightness
 from lab.options.command_line import parse, script, started
 from lab.options.options import FinishedRun, MeasuredOptions
 from lab.options.presets import PRESETS, study
@@ -18,7 +19,7 @@ from lab.reporting.paper import paper_curvature
 from lab.reporting.plots import plot_flow_paths
 from lab.reporting.report import counted, labelled, pooled, setting_title, table, write_report
 from lab.running.comparison import train_all
-from lab.running.measuring import RATIOS, check_flows, held_out, straightness
+from lab.running.measuring import held_out
 from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
 from warmprior.diagnostics import encoded_windows, flow_paths
 

@@ -16,12 +16,12 @@ import pandas as pd
 import torch
 
 from lab.measures.navigation import judge_navigation, play_navigation
+from lab.measures.straightness import check_flows, straightness
 from lab.options.command_line import parse, script, started
 from lab.options.options import Evaluation, Options, Sources, check_single
 from lab.reporting.plots import plot_flow_paths, plot_navigation
 from lab.reporting.report import labelled, table, unlike, write_report
 from lab.running.comparison import train_all
-from lab.running.measuring import check_flows, straightness
 from lab.running.policies import policies_of, trained_actors, write_rows
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from lab.measures import straightness as measures
 from lab.methods.methods import Method
-from lab.running import measuring as measures
 from lab.running.measuring import measure
 from tests.benchmarks.drift import ACTION_DIM, OBSERVATION_DIM, task
 from tests.diagnostics.fields import Field, policy

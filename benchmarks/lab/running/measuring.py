@@ -1,4 +1,4 @@
-"""Measures of policies other than success: source leak, memory gain, and the shape of their flow."""
+"""The job that measures a policy on its training data, and the observations that it has not seen."""
 
 from __future__ import annotations
 
@@ -6,47 +6,33 @@ import copy
 import hashlib
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from tqdm import tqdm
+from tensordict import TensorDictBase
 
 from lab.demonstrations.scripted.generate import generate_demonstrations
 from lab.demonstrations.tasks import place_of, read_like
 from lab.measures.memory_gain import memory_gain
 from lab.measures.source_errors import mean_error, source_coverage
-from lab.measures.statistics import bootstrap_ratio
-from lab.methods.methods import Method
+from lab.measures.straightness import bounds
 from lab.options.options import MeasuredOptions
 from lab.running.policies import Policy
-from warmprior import Prior, WarmPriorActor
 from warmprior.diagnostics import (
     SharedObservations,
-    branching_bound,
     curvature,
     encoded_windows,
     source_leak,
 )
-from warmprior.diagnostics.flow import allowed_nfes, depends_on_history
+from warmprior.diagnostics.flow import allowed_nfes
 from warmprior.keys import EPISODE, OBSERVATION, STATE
-from warmprior.modules.network import device_of
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # seed of generated held-out demonstrations; training data have seed 0
 
 TRAINED_ON = "the TRAINING demonstrations (not held out)"
-
-# By name, the entry of `curvature` that is divided by the first policy's.
-RATIOS = {
-    "ratio": "kappa",
-    "ratio_executed": "kappa_executed",
-    "ratio_relative": "relative_executed",
-    "ratio_one_step": "one_step_error_executed",
-}
 
 
 def measure(
@@ -93,17 +79,6 @@ def measure(
         }
         for nfe in allowed
     }
-
-
-def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
-    """Return the bound of the branching cost, over all and over executed positions; NaN if there is none."""
-    if not coupled:
-        try:
-            bound = branching_bound(batch, prior)
-            return torch.stack([bound[key].nanmean().cpu() for key in ("total", "total_executed")])
-        except ValueError:  # a source that is not Gaussian
-            pass
-    return torch.full((2,), math.nan)
 
 
 def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
@@ -166,87 +141,3 @@ def _episodes(data: TensorDictBase) -> list[str]:
     lengths = [n for n in data[EPISODE].flatten().bincount().tolist() if n]
     parts = vector.cpu().contiguous().split(lengths)
     return [hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in parts]
-
-
-def check_flows(methods: Iterable[Method]) -> None:
-    """Raise ValueError if none of the methods has a flow that could be measured."""
-    if not any(method.is_flow for method in methods):
-        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
-
-
-def straightness(
-    policies: Mapping[Method, Mapping[int, WarmPriorActor]],
-    observations: SharedObservations,
-    *,
-    draws: int = 1,
-    seed: int = 0,
-    **options: Any,
-) -> list[dict[str, Any]]:
-    """Return curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
-
-    Every policy is measured with the history of its training. If it depends on the history, it is also
-    measured with the history of deployment, made from its own prediction one decision earlier. There is a row
-    per policy, training seed and history (`mean`), and one with `seed` None for the average over several
-    seeds. Options are those of `curvature`.
-    """
-    check_flows(policies)
-    policies = {method: actors for method, actors in policies.items() if method.is_flow}
-    seeds = sorted(next(iter(policies.values())))
-    # By method and history, per seed: curvatures, and bounds of the branching cost.
-    measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}
-    jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
-    for method, actor in tqdm(jobs, desc="curvature", disable=None):
-        windows = observations.windows(actor.prior, see_history=actor.sees_history)
-        device = device_of(actor, windows)
-        # For the earlier prediction, whose noise is independent of the next at deployment.
-        earlier = torch.Generator(device).manual_seed(seed + 1)
-        batches = {"training": encoded_windows(actor, windows)}
-        if depends_on_history(actor, batches["training"]):
-            batches["deployed"] = observations.deployed(actor, generator=earlier)
-        for mean, batch in batches.items():
-            # The same source noise for every policy and history.
-            generator = torch.Generator(device).manual_seed(seed)
-            try:
-                values = curvature(actor, batch, draws=draws, generator=generator, **options).cpu()
-            except FloatingPointError as error:
-                raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
-            limits = bounds(actor.prior, batch, method.parts.coupling is not None)
-            measured.setdefault((method, mean), []).append((values, limits))
-    first = [values for values, _ in measured[next(iter(policies)), "training"]]
-    rows = []
-    for (method, mean), by_seed in measured.items():
-        parts: list[Any] = [(s, *pair, base) for s, pair, base in zip(seeds, by_seed, first, strict=True)]
-        if len(seeds) > 1:
-            every = zip(*by_seed, strict=True)
-            # NaN where any seed predicts no motion, because the others alone are no mean over the seeds.
-            averages = (torch.stack(list(one)).mean(0) for one in (*every, first))
-            parts.append((None, *averages))
-        for s, values, limits, baseline in parts:
-            rows.append(
-                {
-                    "policy": str(method),
-                    **method.facts,
-                    "mean": mean,
-                    "seed": s,
-                    "observations": len(observations),
-                    **{key: float(value.nanmean()) for key, value in values.items()},
-                    **dict(zip(("bound", "bound_executed"), limits.tolist(), strict=True)),
-                    **ratios(values, baseline, observations.episodes, seed),
-                }
-            )
-    return rows
-
-
-def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int) -> dict[str, float]:
-    """Return the ratios to the first policy, with their 95% intervals."""
-    result: dict[str, float] = {}
-    # A field that predicts no motion has no one-step error either, so it is left out.
-    still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
-    for name, key in RATIOS.items():
-        generator = torch.Generator().manual_seed(seed)
-        counted = values[key]
-        if name == "ratio_one_step":
-            counted = counted.masked_fill(still, math.nan)
-        ends = bootstrap_ratio(counted, baseline[key], episodes, generator=generator)
-        result |= zip((name, f"{name}_low", f"{name}_high"), ends, strict=True)
-    return result
