@@ -176,7 +176,7 @@ def main(argv: list[str] | None) -> None:
                 "algorithm": arm.algorithm,
                 **arm.method.facts,
                 "centre": arm.centre if arm.method.has_anchor else "",
-                "delta": options.agent(arm, seed).box(arm.policy(actor)),
+                "delta": options.agent(arm, seed).delta_for(arm.policy(actor)),
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }

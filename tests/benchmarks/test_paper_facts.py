@@ -328,7 +328,7 @@ def test_the_agents():
         prior = kind(2)
         actor = WarmPriorActor(VelocityMLP(1, 1, prior.prediction_length, hidden_dim=8), prior)
         expected = facts.BOX_AROUND_ZERO if name == "gaussian" else facts.BOX_AROUND_MEAN
-        assert PriorSpaceConfig().box(actor) == expected
+        assert PriorSpaceConfig().delta_for(actor) == expected
     assert presets["unit"].delta == (facts.BOX_AROUND_MEAN, facts.BOX_AROUND_ZERO)
 
 

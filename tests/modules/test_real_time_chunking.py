@@ -11,7 +11,7 @@ from tests.errors import raises
 from tests.toy_env import mlp_actor, stirred
 from warmprior import PastPrior, PreviewPrior, PriorDecoder, RealTimeChunking
 from warmprior.history import advance, cold_history, without
-from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.modules.real_time_chunking import spliced
 
 B, P, D = 3, 10, 4
 
@@ -132,7 +132,7 @@ def test_known_posteriors_of_gaussians(t, std):
     mean, mu = (torch.randn(1, P, D, generator=generator, dtype=a.dtype) for _ in range(2))
     sigma = torch.where(torch.arange(P) < P // 2, 0.5, 1.0).to(a).view(1, P, 1)
     velocity = gaussian_velocity(mean, std, mu, sigma)
-    left = torch.arange(P) % 2 == 0  # of the leftover every second position is made to count
+    left = torch.arange(P) % 2 == 0  # of the forecast every second position is made to count
     rtc = RealTimeChunking(schedule="ones", max_guidance_weight=1e9, data_std=std)
     everything, delay = torch.full((B, 1), P), torch.zeros(B, 1, dtype=torch.int64)
     target = torch.where(left.view(1, P, 1), y, a + (1 - t) * velocity(at(t, a), a))
@@ -154,7 +154,7 @@ def test_the_weight_at_both_ends():
     assert RealTimeChunking().guidance_weight(ends, torch.tensor(0.0)).tolist() == [0.0, 5.0]
 
 
-def test_rows_without_a_leftover_are_not_guided():
+def test_rows_without_a_forecast_are_not_guided():
     velocity = network()
     a, y, left, delay = batch()
     left[1] = 0
@@ -191,7 +191,7 @@ def test_options_and_delays_that_cannot_be():
     with raises(ValueError, "horizon=2", "delay", 3):
         RealTimeChunking(horizon=2).guided(network(), y, left, delay)
     for wrong in ((left[:2], delay), (left, delay.squeeze(1))):
-        with raises(ValueError, "left", "delay", "[B, 1]"):
+        with raises(ValueError, "forecast_steps", "delay", "[B, 1]"):
             RealTimeChunking().guided(network(), y, *wrong)
 
 
@@ -257,6 +257,6 @@ def test_missing_keys_and_decoders():
 
 
 def test_what_is_executed_of_a_late_chunk():
-    chunk, leftover = torch.zeros(3, 4, 1), torch.ones(3, 4, 1)
-    found = with_leftover(chunk, leftover, torch.tensor([[0], [1], [4]]))
+    chunk, forecast = torch.zeros(3, 4, 1), torch.ones(3, 4, 1)
+    found = spliced(chunk, forecast, torch.tensor([[0], [1], [4]]))
     assert found.squeeze(-1).tolist() == [[0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 1, 1]]

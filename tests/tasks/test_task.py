@@ -15,7 +15,7 @@ from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
-from warmprior import GaussianPrior, PoseTrend, RestingJoints, keys
+from warmprior import GaussianPrior, RestingJoints, RestingTrend, keys
 from warmprior.data import demonstrations_of, open_demonstrations
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
@@ -127,7 +127,7 @@ def test_absolute_actions_have_the_units_of_deltas(path):
     options = NetworkOptions(hidden_dim=16)
     made = [new_policy(t, GaussianPrior(8), options, TrainingConfig()) for t in (delta, absolute)]
     trends = [actor.network.trend for actor in made]
-    assert trends[0] is None and isinstance(trends[1], PoseTrend)
+    assert trends[0] is None and isinstance(trends[1], RestingTrend)
 
 
 def joint_steps(n=400):

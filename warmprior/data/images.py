@@ -89,7 +89,7 @@ def check_images(demonstrations: Demonstrations, index: DatasetIndex, fast: bool
         raise DatasetError(f"{index.path}: its images were rendered {how}: use fast_rendering={not fast}")
     why = "it holds no states"
     if state is not None:
-        first = demonstrations.only(1).steps(index.observation_keys, index.image_keys)[OBSERVATION][0]
+        first = demonstrations.first(1).steps(index.observation_keys, index.image_keys)[OBSERVATION][0]
         images = {key.removesuffix("_image"): first[key].permute(1, 2, 0).numpy() for key in index.image_keys}
         try:
             StateRenderer(index, index.image_size, fast).compare(state, images, "render these again")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch.distributed as dist
 
-from warmprior.io.distributed import from_leader, rank
+from warmprior.io.distributed import rank, wait_for_leader
 
 
 def go_on_alone() -> None:
     """End all processes but the first, which goes on as if it had been started alone."""
     ends = bool(rank())
-    from_leader(int)  # all have arrived
+    wait_for_leader()
     if dist.is_initialized():
         dist.destroy_process_group()
     if ends:

@@ -13,7 +13,7 @@ from typing import Any
 from unittest import mock
 
 from warmprior.io.extras import require
-from warmprior.io.workers import worker_died
+from warmprior.io.workers import dead_worker_error
 
 
 def available_cores() -> int:
@@ -80,7 +80,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
         executor.shutdown(kill_workers=True)
         if isinstance(error, BrokenProcessPool):
             worker = f"one of {count} workers"
-            raise worker_died(worker, "see its own error above") from error
+            raise dead_worker_error(worker, "see its own error above") from error
         raise
     executor.shutdown()
 

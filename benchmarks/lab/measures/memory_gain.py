@@ -17,8 +17,8 @@ from warmprior.diagnostics.flow import (
     encoded_windows,
     evaluation_mode,
     flat_windows,
+    observe_history,
     predict,
-    seen_anew,
 )
 from warmprior.diagnostics.leaks import shifted
 
@@ -49,8 +49,8 @@ def memory_gain(
     \rho)/H)`, with a ``correlation`` of :math:`\rho`, the gain of an exact flow is :math:`s^2 / (s^2 + V)` at
     one Euler step, and :math:`s / \sqrt{s^2 + V}` at infinitely many.
 
-    Windows without a history do not count. Actions beyond the policy's ``clip`` count as 0. The leftover that
-    guides a policy is not shifted.
+    Windows without a history do not count. Actions beyond the policy's ``clip`` count as 0. The forecast
+    that guides a policy is not shifted.
 
     Args:
         policy: the policy; its state does not change.
@@ -98,7 +98,7 @@ def memory_gain(
 
     def predicted(shift: float) -> dict[int, Tensor]:
         generator.set_state(state)  # the same noise on both sides
-        rows = seen_anew(
+        rows = observe_history(
             policy, plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction))
         )
         rows = encoded_windows(policy, rows).select(*policy.in_keys)
@@ -122,7 +122,7 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
     if not policy.sees_history:
         return
     key = policy.observation_key
-    stored, updated = windows.get(key), seen_anew(policy, windows.copy()).get(key)
+    stored, updated = windows.get(key), observe_history(policy, windows.copy()).get(key)
     if isinstance(stored, TensorDictBase):
         stored, updated = stored.get(keys.STATE), updated.get(keys.STATE)
     if stored.shape != updated.shape or not torch.allclose(stored.to(updated.dtype), updated):

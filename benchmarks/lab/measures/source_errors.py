@@ -11,7 +11,7 @@ from torch import Tensor
 
 from warmprior import Source, WarmPriorActor, keys
 from warmprior.checks import check_keys
-from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, judged, predict
+from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, inputs_and_targets, predict
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def mean_error(
         >>> mean_error(untrained, shared.windows(untrained.prior)).target  # the target itself
         0.0
     """
-    flat, target, rows, generator = judged(policy, windows)
+    flat, target, rows, generator = inputs_and_targets(policy, windows)
     with evaluation_mode(policy):
         nfe = policy.sampling.evaluations(nfe)
         chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
@@ -114,8 +114,8 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
 
     Args:
         policy: the policy, whose prior gives the source (:meth:`Prior.distribution`).
-        windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.met`; held-out ones for a
-            learned source.
+        windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.deployed`; held-out ones
+            for a learned source.
         level: probability of the interval :math:`\mu \pm z s`.
 
     Returns:

@@ -29,7 +29,6 @@ class MIPInterpolant(LinearInterpolant):
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the point on the path and its velocity."""
         return super().__call__(torch.where(t[..., None, None] > 0, a0, 0.0), a1, t)
 
 

@@ -51,22 +51,22 @@ def measure(
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
         leaks = source_leak(policy, encoded, nfes=nfes, episodes=shared.episodes)
     generator = torch.Generator().manual_seed(0)
-    met = shared.met(policy, generator=generator)
+    deployed = shared.deployed(policy, generator=generator)
     allowed = allowed_nfes(policy, nfes)
-    means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
+    means = {nfe: mean_error(policy, deployed, nfe=nfe) for nfe in allowed}
     gains = memory_gain(policy, windows if policy.sees_history else encoded, nfes=nfes)
     # The curvature of the flow between source and targets, over the executed positions.
     kappa, relative = math.nan, math.nan
     if policy.sampling.max_nfe is None:
         with warnings.catch_warnings():  # NaN marks a field that does not move
             warnings.simplefilter("ignore")
-            values = curvature(policy, met, generator=generator)
+            values = curvature(policy, deployed, generator=generator)
         kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
     flow = {
         "kappa": kappa,
         "relative_curvature": relative,
-        "bound": float(bounds(policy.prior, met, method.parts.coupling is not None)[1]),
-        "coverage": source_coverage(policy, met),
+        "bound": float(bounds(policy.prior, deployed, method.parts.coupling is not None)[1]),
+        "coverage": source_coverage(policy, deployed),
     }
     return {
         nfe: {
