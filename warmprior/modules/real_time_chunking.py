@@ -17,12 +17,10 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
     "exp": lambda linear: linear * torch.expm1(linear) / (math.e - 1),
     "linear": lambda linear: linear,
-    "ones": torch.ones_like,
-    "zeros": lambda linear: (linear >= 1).to(linear),
 }
 """Schedules of the weight after the delay, by name; each is a function of a weight that falls linearly."""
 
-Schedule = Literal["exp", "linear", "ones", "zeros"]
+Schedule = Literal["exp", "linear"]
 
 
 def spliced(chunk: Tensor, forecast: Tensor, delay: Tensor) -> Tensor:
@@ -44,10 +42,10 @@ class RealTimeChunking:
 
     .. math::
         v' = v + \min\!\big(g(t), \beta\big)\; J^\top W (Y - \hat a), \qquad
-        g(t) = \frac{\sigma^2}{S^2} \frac{1-t}{t} + \frac{t}{1-t}.
+        g(t) = \sigma^2\, \frac{1-t}{t} + \frac{t}{1-t}.
 
-    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation :math:`S`
-    (docs/real_time_chunking.md derives it). :math:`\sigma = S = 1` is the published weight,
+    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation 1
+    (docs/real_time_chunking.md derives it). :math:`\sigma = 1` is the published weight,
     :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
     (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the first ``d`` positions, at which the old
     chunk is executed, then falls as ``schedule`` says, and is 0 from ``horizon`` on.
@@ -55,14 +53,12 @@ class RealTimeChunking:
     Args:
         horizon: first position without guidance (LeRobot's execution_horizon, the official code's
             prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
-        schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
+        schedule: "exp" (the official default) or "linear" (LeRobot's).
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
         jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and
             takes 0.6 of the time, but is no longer exact in the Gaussian case.
         sigma: the source's standard deviation in the weight; by default that of the policy's source. 1 gives
             the published weight.
-        data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
-            POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
 
     Raises:
         ValueError: if the schedule is unknown, or a number is out of range.
@@ -82,12 +78,11 @@ class RealTimeChunking:
     max_guidance_weight: float = 5.0
     jacobian: bool = True
     sigma: float | None = None
-    data_std: float = 1.0
 
     def __post_init__(self) -> None:
         check_choice("schedule", self.schedule, SCHEDULES)
         check_whole_numbers(**given(horizon=self.horizon))
-        check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
+        check_positive(max_guidance_weight=self.max_guidance_weight)
         check_not_negative(**given(sigma=self.sigma))
 
     def check_reach(self, delay: int, forecast_steps: int) -> None:
@@ -119,7 +114,7 @@ class RealTimeChunking:
         if self.sigma is not None:
             sigma = self.sigma
         tiny = torch.finfo(t.dtype).tiny
-        source = (sigma / self.data_std) ** 2 * ((1 - t) / t.clamp(min=tiny))
+        source = sigma**2 * ((1 - t) / t.clamp(min=tiny))
         data = t / (1 - t).clamp(min=tiny)
         return (source + data).clamp(max=self.max_guidance_weight)
 
