@@ -13,16 +13,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 
-from lab.command_line import parse, script, started
-from lab.comparison import compare
-from lab.measures import held_out
-from lab.options import MeasuredOptions, check_given, check_single
-from lab.plots import plot_lines
-from lab.policies import policies_of, write_rows
-from lab.presets import PRESETS, study
-from lab.report import labelled, per_seed, table, write_report
-from lab.rows import PLAYED, read_rows
-from lab.tasks import check_counts, title_of
+from lab.demonstrations.tasks import check_counts, title_of
+from lab.options.command_line import parse, script, started
+from lab.options.options import MeasuredOptions, check_given, check_single
+from lab.options.presets import PRESETS, study
+from lab.reporting.plots import plot_lines
+from lab.reporting.report import labelled, per_seed, table, write_report
+from lab.reporting.rows import PLAYED, read_rows
+from lab.running.comparison import compare
+from lab.running.measuring import held_out
+from lab.running.policies import policies_of, write_rows
 from warmprior.diagnostics import action_error, encoded_windows
 from warmprior.training import TrainingConfig
 

@@ -9,9 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from lab.cards import measured
-from lab.command_line import script
-from lab.report import policy_results
+from lab.options.command_line import script
+from lab.reporting.cards import measured
+from lab.reporting.report import policy_results
 from warmprior.saving import load_policy, model_card
 
 

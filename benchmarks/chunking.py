@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import sys
 
-from lab.command_line import parse, script, started
-from lab.comparison import compare
-from lab.options import check_single, with_parts
-from lab.paper import PAPER_CHUNK
-from lab.plots import plot_bars, plot_lines, plot_success
-from lab.policies import policies_of, slug
-from lab.presets import PRESETS
-from lab.report import at_fewest, counted, labelled, per_seed, table, write_report
+from lab.options.command_line import parse, script, started
+from lab.options.options import check_single, with_parts
+from lab.options.presets import PRESETS
+from lab.reporting.paper import PAPER_CHUNK
+from lab.reporting.plots import plot_bars, plot_lines, plot_success
+from lab.reporting.report import at_fewest, counted, labelled, per_seed, table, write_report
+from lab.running.comparison import compare
+from lab.running.policies import policies_of, slug
 
 JUMPS = ("boundary_jump", "inner_jump")
 

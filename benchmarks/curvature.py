@@ -11,15 +11,16 @@ from dataclasses import dataclass
 
 import torch
 
-from lab.command_line import parse, script, started
-from lab.comparison import train_all
-from lab.measures import RATIOS, check_flows, held_out, straightness
-from lab.options import FinishedRun, MeasuredOptions
-from lab.paper import paper_curvature
-from lab.plots import plot_flow_paths
-from lab.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
-from lab.presets import PRESETS, study
-from lab.report import counted, labelled, pooled, setting_title, table, write_report
+from lab.measures.straightness import RATIOS, check_flows, straightness
+from lab.options.command_line import parse, script, started
+from lab.options.options import FinishedRun, MeasuredOptions
+from lab.options.presets import PRESETS, study
+from lab.reporting.paper import paper_curvature
+from lab.reporting.plots import plot_flow_paths
+from lab.reporting.report import counted, labelled, pooled, setting_title, table, write_report
+from lab.running.comparison import train_all
+from lab.running.measuring import held_out
+from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
 from warmprior.diagnostics import encoded_windows, flow_paths
 
 

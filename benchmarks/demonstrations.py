@@ -11,11 +11,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from lab.command_line import script
-from lab.downloads import OFFICIAL, download_robomimic
-from lab.render import render_demonstrations
-from lab.scripted.generate import generate_demonstrations
-from lab.scripted.tasks import EXPERTS
+from lab.demonstrations.downloads import OFFICIAL, download_robomimic
+from lab.demonstrations.render import render_demonstrations
+from lab.demonstrations.scripted.generate import generate_demonstrations
+from lab.demonstrations.scripted.tasks import EXPERTS
+from lab.options.command_line import script
 
 
 @script("demonstrations.py", hint="")

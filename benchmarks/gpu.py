@@ -25,16 +25,16 @@ from xml.etree import ElementTree
 import throughput
 from tqdm import tqdm
 
-from lab.command_line import read, script
-from lab.comparison import EPISODES_PER_JOB, train_all
-from lab.files import ERRORS, PartialFailure, read_lines
-from lab.jobs import Jobs
-from lab.machine import check_device, facts_of_machine
-from lab.options import Options, check_given, with_parts
-from lab.policies import Cell, Policy, play, policies_of, row
-from lab.presets import PRESETS, adapted
-from lab.tasks import check_counts
-from lab.timing import Clock
+from lab.demonstrations.tasks import check_counts
+from lab.io.files import ERRORS, PartialFailure, read_lines
+from lab.io.machine import check_device, facts_of_machine
+from lab.measures.timing import Clock
+from lab.options.command_line import read, script
+from lab.options.options import Options, check_given, with_parts
+from lab.options.presets import PRESETS, adapted
+from lab.running.comparison import EPISODES_PER_JOB, train_all
+from lab.running.jobs import Jobs
+from lab.running.policies import Cell, Policy, play, policies_of, row
 from warmprior.checks import check_choice, check_positive
 from warmprior.io.files import check_writable, write_atomic
 

@@ -19,12 +19,12 @@ import numpy as np
 from robomimic import run
 from tqdm import tqdm
 
-from lab.command_line import script
-from lab.options import with_parts
-from lab.presets import PRESETS
-from lab.scripted.episode import Episode, write_robomimic
-from lab.scripted.generate import generate_demonstrations
-from lab.tasks import DataOptions
+from lab.demonstrations.scripted.episode import Episode, write_robomimic
+from lab.demonstrations.scripted.generate import generate_demonstrations
+from lab.demonstrations.tasks import DataOptions
+from lab.options.command_line import script
+from lab.options.options import with_parts
+from lab.options.presets import PRESETS
 from warmprior.data import open_demonstrations
 from warmprior.data.formats.hdf5 import open_robomimic, selected_demos
 from warmprior.envs.control_loop import StepLoop

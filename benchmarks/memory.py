@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from lab.command_line import script
-from lab.options import Options
-from lab.plots import colors_of, new_figure, save
-from lab.report import baseline, summary, table
-from lab.rows import PLAYED, read_rows
-from lab.stored_options import stored_options
+from lab.options.command_line import script
+from lab.options.options import Options
+from lab.options.stored_options import stored_options
+from lab.reporting.plots import colors_of, new_figure, save
+from lab.reporting.report import baseline, summary, table
+from lab.reporting.rows import PLAYED, read_rows
 
 
 @script("memory.py", hint="")

@@ -16,9 +16,9 @@ import sys
 
 from robomimic import run
 
-from lab.command_line import script
-from lab.options import Options, with_parts
-from lab.presets import IMAGES, PRESETS, adapted
+from lab.options.command_line import script
+from lab.options.options import Options, with_parts
+from lab.options.presets import IMAGES, PRESETS, adapted
 
 LARGE = ("paper", "much-ado")  # presets for a GPU, whose policies see images
 

@@ -15,14 +15,14 @@ from typing import Any
 import pandas as pd
 import torch
 
-from lab.command_line import parse, script, started
-from lab.comparison import train_all
-from lab.measures import check_flows, straightness
-from lab.navigation import judge_navigation, play_navigation
-from lab.options import Evaluation, Options, Sources, check_single
-from lab.plots import plot_flow_paths, plot_navigation
-from lab.policies import policies_of, trained_actors, write_rows
-from lab.report import labelled, table, unlike, write_report
+from lab.measures.navigation import judge_navigation, play_navigation
+from lab.measures.straightness import check_flows, straightness
+from lab.options.command_line import parse, script, started
+from lab.options.options import Evaluation, Options, Sources, check_single
+from lab.reporting.plots import plot_flow_paths, plot_navigation
+from lab.reporting.report import labelled, table, unlike, write_report
+from lab.running.comparison import train_all
+from lab.running.policies import policies_of, trained_actors, write_rows
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig
 from warmprior.training.options import PAPER

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from pandas import DataFrame
 
-from lab.command_line import script
-from lab.source_errors import error_by_position
+from lab.measures.source_errors import error_by_position
+from lab.options.command_line import script
 from warmprior.data import open_demonstrations
 from warmprior.diagnostics import SharedObservations
 from warmprior.keys import EPISODE
@@ -58,7 +58,7 @@ def main(argv: list[str] | None) -> None:
             shared = SharedObservations(data, prior.chunk_length, **shape)
             generator = torch.Generator().manual_seed(0)
             order = torch.randperm(len(shared), generator=generator)[: args.windows]
-            windows = shared.subset(order.sort()[0]).met(policy, generator=generator)
+            windows = shared.subset(order.sort()[0]).deployed(policy, generator=generator)
             for nfe in (9, 1):
                 mean, chunk = error_by_position(policy, windows, nfe=nfe)
                 rows.append(

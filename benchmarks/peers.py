@@ -34,8 +34,8 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
-from lab.machine import check_device, facts_of_machine
-from lab.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
+from lab.io.machine import check_device, facts_of_machine
+from lab.measures.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from warmprior import (
     AdaLNTransformer,
     ChiTransformer,

@@ -20,7 +20,14 @@ from typing import Any
 import pandas as pd
 from navigation1d import NAVIGATION_PRESETS
 
-from lab.agents import (
+from lab.demonstrations.tasks import DataOptions
+from lab.options.command_line import parse, script, started
+from lab.options.options import Evaluation, Sources, with_parts
+from lab.options.presets import PRESETS, study
+from lab.reporting.plots import plot_lines, plot_success
+from lab.reporting.report import labelled, setting_title, table, write_report
+from lab.reporting.rows import AGENT, read_rows
+from lab.running.agents import (
     TOY,
     AgentOptions,
     AgentsOptions,
@@ -29,14 +36,7 @@ from lab.agents import (
     environment,
     frozen_policies,
 )
-from lab.command_line import parse, script, started
-from lab.options import Evaluation, Sources, with_parts
-from lab.plots import plot_lines, plot_success
-from lab.policies import slug, write_rows
-from lab.presets import PRESETS, study
-from lab.report import labelled, setting_title, table, write_report
-from lab.rows import AGENT, read_rows
-from lab.tasks import DataOptions
+from lab.running.policies import slug, write_rows
 from warmprior import WarmPriorActor
 from warmprior.checks import given
 from warmprior.io.files import read_json
@@ -140,7 +140,7 @@ def learn(
     parts = given(horizon=options.data.horizon) | options.evaluation.environment
     rounds = None
     if options.collectors is not None:
-        from lab.ray_collection import ray_rounds
+        from lab.running.ray_collection import ray_rounds
 
         rounds = partial(ray_rounds, collectors=options.collectors, address=options.run.ray_address)
     encoders = encoding(actor)  # a policy of images reads the same features as the agent
@@ -176,7 +176,7 @@ def main(argv: list[str] | None) -> None:
                 "algorithm": arm.algorithm,
                 **arm.method.facts,
                 "centre": arm.centre if arm.method.has_anchor else "",
-                "delta": options.agent(arm, seed).box(arm.policy(actor)),
+                "delta": options.agent(arm, seed).delta_for(arm.policy(actor)),
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }

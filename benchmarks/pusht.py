@@ -19,10 +19,10 @@ import numpy as np
 from robomimic import run
 from torchrl.envs import EnvBase
 
-from lab.command_line import script
-from lab.options import with_parts
-from lab.presets import PRESETS
-from lab.tasks import DataOptions
+from lab.demonstrations.tasks import DataOptions
+from lab.options.command_line import script
+from lab.options.options import with_parts
+from lab.options.presets import PRESETS
 from warmprior.data import demonstrations_of, open_demonstrations
 from warmprior.envs import gym_env
 from warmprior.io.extras import require

@@ -16,15 +16,15 @@ import sys
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
-from lab.command_line import parse, script, started
-from lab.comparison import compare
-from lab.methods import Method
-from lab.options import Options, check_given, check_single
-from lab.plots import plot_bars
-from lab.policies import Cell, policies_of
-from lab.presets import PRESETS, study
-from lab.report import counted, labelled, per_seed, table, write_report
-from lab.tasks import check_counts
+from lab.demonstrations.tasks import check_counts
+from lab.methods.methods import Method
+from lab.options.command_line import parse, script, started
+from lab.options.options import Options, check_given, check_single
+from lab.options.presets import PRESETS, study
+from lab.reporting.plots import plot_bars
+from lab.reporting.report import counted, labelled, per_seed, table, write_report
+from lab.running.comparison import compare
+from lab.running.policies import Cell, policies_of
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.transforms.delay import check_delay
 

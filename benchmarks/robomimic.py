@@ -14,14 +14,14 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from lab.command_line import parse, script, started
-from lab.comparison import compare
-from lab.options import Options
-from lab.phases import Phases
-from lab.pictures import draw, films
-from lab.policies import policies_of
-from lab.presets import PRESETS, WHY_QUICK
-from lab.report import success_report, summary, terminal_table, unlike, write_report
+from lab.options.command_line import parse, script, started
+from lab.options.options import Options
+from lab.options.presets import PRESETS, WHY_QUICK
+from lab.reporting.report import success_report, summary, terminal_table, unlike, write_report
+from lab.running.comparison import compare
+from lab.running.phases import Phases
+from lab.running.pictures import draw, films
+from lab.running.policies import policies_of
 
 
 def run(
@@ -33,8 +33,8 @@ def run(
     phases.end("imports and options")
     with started(options, study) as out:
         # Demonstrations are generated, downloaded, or read from --dataset. There is a policy per task, method
-        # and seed. Policies of a task differ in the source alone (lab/methods.py); `train` in lab/policies.py
-        # gives it to the loss.
+        # and seed. Policies of a task differ in the source alone (lab/methods/methods.py); `train`
+        # in lab/running/policies.py gives it to the loss.
         policies = policies_of(options)
         phases.end("demonstrations")
 

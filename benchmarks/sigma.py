@@ -15,16 +15,17 @@ from dataclasses import replace
 
 import pandas as pd
 
-from lab.command_line import parse, script, started
-from lab.comparison import compare
-from lab.measures import check_flows, held_out, straightness
-from lab.options import MeasuredOptions, Options, check_single
-from lab.paper import paper_success
-from lab.plots import plot_lines
-from lab.policies import policies_of, trained_actors, write_rows
-from lab.presets import PRESETS, study
-from lab.report import labelled, per_seed, pooled, table, write_report
-from lab.tasks import title_of
+from lab.demonstrations.tasks import title_of
+from lab.measures.straightness import check_flows, straightness
+from lab.options.command_line import parse, script, started
+from lab.options.options import MeasuredOptions, Options, check_single
+from lab.options.presets import PRESETS, study
+from lab.reporting.paper import paper_success
+from lab.reporting.plots import plot_lines
+from lab.reporting.report import labelled, per_seed, pooled, table, write_report
+from lab.running.comparison import compare
+from lab.running.measuring import held_out
+from lab.running.policies import policies_of, trained_actors, write_rows
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 

@@ -32,9 +32,9 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from tqdm import tqdm
 
-from lab.command_line import script
-from lab.machine import facts_of_machine
-from lab.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
+from lab.io.machine import facts_of_machine
+from lab.measures.timing import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
+from lab.options.command_line import script
 from warmprior import (
     ChiTransformer,
     ChunkStep,

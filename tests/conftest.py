@@ -122,12 +122,12 @@ def lift_demonstrations(tmp_path_factory):
     pytest.importorskip("robosuite")
     from filelock import FileLock
 
-    from lab.scripted.generate import generate_demonstrations
+    from lab.demonstrations.scripted.generate import generate_demonstrations
     from tests.processes import here
 
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    generate = "lab.scripted.generate"
+    generate = "lab.demonstrations.scripted.generate"
     cache = patch.dict(os.environ, WARMPRIOR_CACHE=str(folder / "demonstrations"))
     with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here), cache:
         return generate_demonstrations("lift", n=3, workers=1)

@@ -54,7 +54,7 @@ def apart(function):
 
 @contextmanager
 def here(count, state):
-    """``lab.workers.working`` in this process, where others would take seconds to start.
+    """``lab.io.workers.working`` in this process, where others would take seconds to start.
 
     State and jobs are pickled, as for others.
     """

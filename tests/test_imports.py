@@ -115,6 +115,9 @@ ROOMS = [
 ]
 """Each may import those before it alone."""
 
+ROOMS_OF_THE_LAB = ["io", "demonstrations", "methods", "options", "measures", "reporting", "running"]
+"""The same holds here."""
+
 
 def imported(path):
     for node in ast.walk(ast.parse(path.read_text())):
@@ -140,6 +143,19 @@ def test_imports_point_one_way_and_name_nothing_private():
             if place[1:2] != [room]:
                 private = [n for n in (*place, *names) if n.startswith("_") and n != "__main__"]
                 assert not private, f"{path} imports {private}"
+
+
+def test_imports_of_the_lab_point_one_way():
+    lab = BENCHMARKS / "lab"
+    assert {path.parent.name for path in lab.glob("*/__init__.py")} == set(ROOMS_OF_THE_LAB)
+    assert {path.name for path in lab.glob("*.py")} == {"__init__.py"}
+    for path in lab.glob("*/**/*.py"):
+        room = ROOMS_OF_THE_LAB.index(path.relative_to(lab).parts[0])
+        for module, names in imported(path):
+            place = module.split(".")
+            if place[0] == "lab":
+                for other in place[1:2] or names:
+                    assert ROOMS_OF_THE_LAB.index(other) <= room, f"{path} imports {module}"
 
 
 PACKAGE = Path(warmprior.__file__).parent

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from lab.methods import Method
+from lab.methods.methods import Method
 from tests.errors import raises
 from tests.toy_env import Halfway, demonstrations
 from warmprior import (

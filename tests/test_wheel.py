@@ -87,7 +87,11 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
     wanted = "pyproject.toml README.md CHANGELOG.md LICENSE CITATION.cff CONTRIBUTING.md Makefile"
     assert set(wanted.split()) <= names
     assert {"constraints.txt", "docs/conf.py", "tests/conftest.py"} <= names
-    assert {"benchmarks/lab/options.py", "benchmarks/lab/scripted/tasks.py", "tests/lab/__init__.py"} <= names
+    assert {
+        "benchmarks/lab/options/options.py",
+        "benchmarks/lab/demonstrations/scripted/tasks.py",
+        "tests/lab/__init__.py",
+    } <= names
     for folder in ("benchmarks", "docs", "tests", "plugins"):
         files = {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*.py")}
         assert {name for name in files if not built_here.search(name)} <= names

@@ -247,7 +247,7 @@ def improve(
         seed=seed,
     )
     print(
-        f"{algorithm} around a box of +-{config.box(actor):g}: {steps:,} control steps, the first "
+        f"{algorithm} around a box of +-{config.delta_for(actor):g}: {steps:,} control steps, the first "
         f"{warmup:,} without an agent; {config.updates} updates per step of {num_envs} simulators, discount "
         f"{config.gamma:g} per chunk, NFE {config.nfe}",
         flush=True,

@@ -129,13 +129,13 @@ def caught_up(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> Tenso
         >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
         {'actions': [2.0, 3.0], 'forecast': [4.0, 0.0, 0.0, 0.0], 'forecast_steps': [1], 'steps': [2]}
     """
-    left, remembered = chunk.shape[-2] - executed, history["actions"].shape[-2]
+    forecast_steps, remembered = chunk.shape[-2] - executed, history["actions"].shape[-2]
     while True:
         some = executed.clamp(max=remembered)
         history = advance(history, chunk, some)
         chunk, executed = history["forecast"], executed - some
         if not executed.any():
-            return history.update({"forecast_steps": left})
+            return history.update({"forecast_steps": forecast_steps})
 
 
 def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: int) -> TensorDict:

@@ -37,8 +37,8 @@ from shared import (
     with_own_noise,
 )
 
-from lab.paper import PAPER_SUCCESS
-from lab.statistics import interval, spread_of
+from lab.measures.statistics import interval, spread_of
+from lab.reporting.paper import PAPER_SUCCESS
 
 PAGE = DOCS / "leaderboard.md"
 DOOR = "door, 25"

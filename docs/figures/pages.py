@@ -11,7 +11,7 @@ import numpy as np
 from pandas import DataFrame, read_json
 from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
 
-from lab.statistics import chosen_elsewhere
+from lab.measures.statistics import chosen_elsewhere
 
 SLOPES = {"marginal": "over all data", "conditional": "given the observation"}
 

@@ -40,8 +40,8 @@ from shared import (
     with_own_noise,
 )
 
-from lab.paper import PAPER_SUCCESS, STATE
-from lab.statistics import chosen_elsewhere
+from lab.measures.statistics import chosen_elsewhere
+from lab.reporting.paper import PAPER_SUCCESS, STATE
 
 PAGE = DOCS / "results.md"
 TEN, TWENTY_FIVE, MANY = "10", "25", "300 of six operators"

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat, read_json
 
-from lab.methods import METHODS
-from lab.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, spread_of
+from lab.measures.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, spread_of
+from lab.methods.methods import METHODS
 
 INK = "#767676"  # text and lines, which a white and a black page show equally well
 matplotlib.rcParams |= {"savefig.transparent": True, "grid.color": INK, "grid.alpha": 0.3}

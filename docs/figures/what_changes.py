@@ -15,9 +15,9 @@ import torch
 from navigation1d import NAVIGATION_PRESETS
 from shared import DOCS, GAUSSIAN, INK, PAST, PREVIEW, SOURCES
 
-from lab.navigation import play_navigation
-from lab.plots import ABOVE, BELOW, new_figure
-from lab.tasks import navigation_task
+from lab.demonstrations.tasks import navigation_task
+from lab.measures.navigation import play_navigation
+from lab.reporting.plots import ABOVE, BELOW, new_figure
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navigation_positions

@@ -182,7 +182,7 @@ plt.show()
 
 names, kappa, relative, error = [], [], [], []
 for name, actor in actors.items():
-    measured = curvature(actor, shared.met(actor), n_steps=50, draws=4)
+    measured = curvature(actor, shared.deployed(actor), n_steps=50, draws=4)
     names.append(name)
     kappa.append(measured["kappa_executed"].nanmean())
     relative.append(measured["relative_executed"].nanmean())

@@ -218,12 +218,14 @@ for axis, (name, one), color in zip(
     history, chunk = windows["action"][:, :H], windows["action"][:, -H:]
     valid = ~windows["action_is_pad"][:, :H]
     share = one.cold_probability
-    samples = one.source.learn(history, valid, chunk, cold_probability=share)
+    samples = one.source.draw_for_training(
+        history, valid, chunk, cold_probability=share
+    )
     warm = valid.all(1)
     error = (samples - chunk)[warm].square().mean().sqrt()
     step = 24
     forty = torch.full((40,), step)
-    samples = one.source.learn(
+    samples = one.source.draw_for_training(
         history[forty], valid[forty], chunk[forty], cold_probability=share
     )
     axis.plot(

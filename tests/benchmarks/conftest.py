@@ -20,7 +20,7 @@ class Inline:
         return True
 
     def submit(self, job):
-        from lab import jobs
+        from lab.running import jobs
 
         future = Future()
         future.set_result(jobs.call(job.function, job.args))
@@ -47,14 +47,15 @@ def inline(request, short_episodes):
         return
     from matplotlib.figure import Figure
 
-    from lab import jobs, pictures
-    from lab import policies as common
+    from lab.running import jobs, pictures
+    from lab.running import policies as common
 
     with pytest.MonkeyPatch.context() as patch:
         local = jobs.Local
         patch.setattr(jobs, "Local", Inline)
         patch.setattr(pictures, "rendering_backend", lambda: None)
-        places = ("lab.measures.curvature", "curvature.flow_paths", "navigation1d.flow_paths")
+        charts = ("curvature.flow_paths", "navigation1d.flow_paths")
+        places = ("lab.running.measuring.curvature", "lab.measures.straightness.curvature", *charts)
         for place in places if request.path.name != "test_measures.py" else ():  # there they are compared
             module, name = place.rsplit(".", 1)
             measure = getattr(importlib.import_module(module), name)

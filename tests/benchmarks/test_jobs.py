@@ -13,9 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from lab import jobs
-from lab.jobs import Jobs
-from lab.options import Run
+from lab.options.options import Run
+from lab.running import jobs
+from lab.running.jobs import Jobs
 from tests.benchmarks.conftest import Inline
 from tests.errors import raises
 from tests.processes import apart

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from lab.scripted.generate import generate_demonstrations
-from lab.tasks import DataOptions
+from lab.demonstrations.scripted.generate import generate_demonstrations
+from lab.demonstrations.tasks import DataOptions
 from tests.processes import here
 from warmprior.data import convert_robomimic, open_demonstrations
 from warmprior.envs.tasks import TaskSpec
@@ -14,7 +14,7 @@ from warmprior.tasks import Task
 
 def test_follower_gets_the_joints_of_the_next_step(monkeypatch, tmp_path):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
-    monkeypatch.setattr("lab.scripted.generate.working", here)
+    monkeypatch.setattr("lab.demonstrations.scripted.generate.working", here)
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 400)  # an expert needs more
     task = joint_targets.task(DataOptions(demonstrations=(1,)))
     leader = h5py.File(generate_demonstrations("square", "ph", 1))["data/demo_0"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lab.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
+from lab.methods.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, window_replay_buffer, window_transforms
 from warmprior.modules import Prior

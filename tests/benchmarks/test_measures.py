@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from lab import measures
-from lab.measures import measure
-from lab.methods import Method
+from lab.measures import straightness as measures
+from lab.methods.methods import Method
+from lab.running.measuring import measure
 from tests.benchmarks.drift import ACTION_DIM, OBSERVATION_DIM, task
 from tests.diagnostics.fields import Field, policy
 from tests.diagnostics.test_shared_observations import H, steps

@@ -3,8 +3,8 @@ import pickle
 
 import torch
 
-from lab.bridge import BridgeCoupling
-from lab.methods import METHODS, Method
+from lab.methods.bridge import BridgeCoupling
+from lab.methods.methods import METHODS, Method
 from tests.errors import raises
 from warmprior import OTCoupling, ReflowCoupling, VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history

@@ -12,12 +12,12 @@ import robomimic
 import sigma
 from mimicgen_tasks import FEW
 
-from lab.command_line import parse, started
-from lab.options import Options
-from lab.presets import PRESETS, study
-from lab.report import unlike
-from lab.scripted import generate
-from lab.stored_options import from_record, recorded, stored_options
+from lab.demonstrations.scripted import generate
+from lab.options.command_line import parse, started
+from lab.options.options import Options
+from lab.options.presets import PRESETS, study
+from lab.options.stored_options import from_record, recorded, stored_options
+from lab.reporting.report import unlike
 from tests.benchmarks.script_parts import refused
 from tests.errors import raises
 from warmprior.envs.tasks import EVALUATION_SEED

@@ -11,12 +11,13 @@ import robomimic
 import torch
 from torch import nn
 
-from lab import paper, timing
-from lab.command_line import parse
-from lab.options import with_parts
-from lab.presets import IMAGES, PRESETS
-from lab.stored_options import recorded
-from lab.tasks import navigation_task
+from lab.demonstrations.tasks import navigation_task
+from lab.measures import timing
+from lab.options.command_line import parse
+from lab.options.options import with_parts
+from lab.options.presets import IMAGES, PRESETS
+from lab.options.stored_options import recorded
+from lab.reporting import paper
 from tests import paper_facts as facts
 from warmprior import (
     ChiTransformer,
@@ -123,7 +124,7 @@ def test_the_recipe_from_images(monkeypatch):
     assert recipe(with_parts(paper, data={"obs": "image"})) == IMAGE
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
-    monkeypatch.setattr("lab.presets.imagenet_weights", lambda: None)  # nothing is downloaded
+    monkeypatch.setattr("lab.options.presets.imagenet_weights", lambda: None)  # nothing is downloaded
     asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
@@ -153,7 +154,7 @@ def test_the_preset_of_the_public_code_from_the_state(name, monkeypatch):
 
 def test_the_preset_of_the_public_code_from_images(monkeypatch):
     pytest.importorskip("torchvision")
-    monkeypatch.setattr("lab.tasks.require_rendering", lambda: None)
+    monkeypatch.setattr("lab.demonstrations.tasks.require_rendering", lambda: None)
     argv = ["--preset", "much-ado", "--obs", "image", "--out", "out"]
     adapted = {
         name: with_parts(with_parts(PRESETS[name], **IMAGES[name]), data={"obs": "image"})
@@ -329,7 +330,7 @@ def test_the_agents():
         prior = kind(2)
         actor = WarmPriorActor(VelocityMLP(1, 1, prior.prediction_length, hidden_dim=8), prior)
         expected = facts.BOX_AROUND_ZERO if name == "gaussian" else facts.BOX_AROUND_MEAN
-        assert PriorSpaceConfig().box(actor) == expected
+        assert PriorSpaceConfig().delta_for(actor) == expected
     assert presets["unit"].delta == (facts.BOX_AROUND_MEAN, facts.BOX_AROUND_ZERO)
 
 

@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
-from lab import plots
-from lab.report import labelled, per_seed
+from lab.reporting import plots
+from lab.reporting.report import labelled, per_seed
 from tests.benchmarks.test_report import compared, row
 
 

@@ -6,12 +6,12 @@ import robomimic
 import torch
 from torchrl.envs import TransformedEnv
 
-from lab import jobs
-from lab import policies as common
-from lab.command_line import parse
-from lab.measures import measure
-from lab.policies import Cell, play
-from lab.presets import PRESETS
+from lab.options.command_line import parse
+from lab.options.presets import PRESETS
+from lab.running import jobs
+from lab.running import policies as common
+from lab.running.measuring import measure
+from lab.running.policies import Cell, play
 from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
 from tests.benchmarks.drift import DriftEnv, arguments

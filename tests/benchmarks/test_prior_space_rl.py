@@ -6,7 +6,7 @@ import prior_space_rl as benchmark
 import pytest
 import robomimic
 
-from lab.command_line import parse
+from lab.options.command_line import parse
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
 from tests.errors import raises
 from warmprior import VelocityMLP, WarmPriorActor

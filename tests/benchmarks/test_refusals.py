@@ -20,9 +20,12 @@ def no_work(monkeypatch):
         raise AssertionError("work was begun")
 
     loaders = ("generate_demonstrations", "download_robomimic")
-    for place in ("lab.policies.train_policy", *(f"lab.tasks.{name}" for name in loaders)):
+    for place in (
+        "lab.running.policies.train_policy",
+        *(f"lab.demonstrations.tasks.{name}" for name in loaders),
+    ):
         monkeypatch.setattr(place, never)
-    for place in ("lab.tasks.require_rendering", "warmprior.envs.mimicgen.find_spec"):
+    for place in ("lab.demonstrations.tasks.require_rendering", "warmprior.envs.mimicgen.find_spec"):
         monkeypatch.setattr(place, lambda *names: None)
 
 

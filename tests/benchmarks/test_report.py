@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from lab import report
-from lab.command_line import parse, started
-from lab.files import PartialFailure
-from lab.presets import PRESETS
+from lab.io.files import PartialFailure
+from lab.options.command_line import parse, started
+from lab.options.presets import PRESETS
+from lab.reporting import report
 from tests.benchmarks.script_parts import is_png
 from tests.errors import raises
 from tests.paper_facts import SIGMA_SUCCESS, SUCCESS

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lab.methods import Method
+from lab.methods.methods import Method
 from tests.errors import raises
 from tests.toy_env import stirred
 from warmprior import FlowMatchingLoss, VelocityMLP, WarmPriorActor, keys

@@ -13,9 +13,9 @@ import robomimic
 import torch
 from safetensors.torch import load_file
 
-from lab import pictures
-from lab.command_line import parse, started
-from lab.presets import PRESETS
+from lab.options.command_line import parse, started
+from lab.options.presets import PRESETS
+from lab.running import pictures
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.processes import apart
 from warmprior.envs import rendering_backend

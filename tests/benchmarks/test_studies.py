@@ -12,10 +12,10 @@ import robomimic
 import sigma
 import torch
 
-from lab import policies as common
-from lab.measures import held_out
-from lab.options import MeasuredOptions, Options, Run, Sources
-from lab.tasks import DataOptions
+from lab.demonstrations.tasks import DataOptions
+from lab.options.options import MeasuredOptions, Options, Run, Sources
+from lab.running import policies as common
+from lab.running.measuring import held_out
 from tests.benchmarks import drift
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file

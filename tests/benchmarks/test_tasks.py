@@ -8,9 +8,9 @@ import pytest
 import robomimic
 import torch
 
-from lab.options import Options, with_parts
-from lab.policies import policies_of
-from lab.stored_options import stored_options
+from lab.options.options import Options, with_parts
+from lab.options.stored_options import stored_options
+from lab.running.policies import policies_of
 from tests.benchmarks.script_parts import described, flow, options, refused, stored
 from tests.data.synthetic import env_args_14, shortened, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
@@ -76,7 +76,7 @@ def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path
 def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
-    monkeypatch.setattr("lab.render.working", here)
+    monkeypatch.setattr("lab.demonstrations.render.working", here)
     few = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
     file = shortened(lift_demonstrations, tmp_path / "lift.hdf5", 12)
     argv = options(file, tmp_path / "run", prior=["gaussian", "history"], **few)

@@ -63,12 +63,12 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
 
     shared = SharedObservations(steps([12, 9]), H)
     actor = policy(field, prior)
-    met = shared.deployed(actor)
+    deployed = shared.deployed(actor)
     # Predicted H steps earlier, the chunk's second half forecasts exactly the current one.
     expected = shared.frames[:, None] + torch.arange(H)
-    torch.testing.assert_close(met["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0)
-    assert (met["history", "steps"] == H).all()
-    assert torch.equal(met["vla_action", "chunk"], shared.windows(prior)["vla_action", "chunk"])
+    torch.testing.assert_close(deployed["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0)
+    assert (deployed["history", "steps"] == H).all()
+    assert torch.equal(deployed["vla_action", "chunk"], shared.windows(prior)["vla_action", "chunk"])
 
 
 def test_bad_input_is_named():

@@ -18,14 +18,14 @@ import h5py
 import numpy as np
 import pyarrow.parquet as parquet
 
-from lab.options import Options, with_parts
-from lab.presets import PRESETS
-from lab.rows import PLAYED, read_rows
-from lab.stored_options import recorded, stored_options
+from lab.options.options import Options, with_parts
+from lab.options.presets import PRESETS
+from lab.options.stored_options import recorded, stored_options
+from lab.reporting.rows import PLAYED, read_rows
 from tests.data.hdf5_faults import FAULTS, NUMBERS, replace
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.sandbox import Outcome
-from tests.lab.test_rows import ROW
+from tests.lab.reporting.test_rows import ROW
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, training
 from warmprior import (

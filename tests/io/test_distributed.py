@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from lab.machine import check_device
+from lab.io.machine import check_device
 from tests.errors import raises
 from tests.together import together
 from warmprior.io.distributed import launched, leader_first, rank, world_size

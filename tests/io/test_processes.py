@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("loky")
 
-from lab.workers import working
+from lab.io.workers import working
 from tests.errors import raises
 from tests.processes import apart, ended
 from warmprior.io.workers import WorkerError

@@ -12,10 +12,10 @@ from warmprior import (
     GaussianPrior,
     Normalizer,
     PastPrior,
-    PoseTrend,
     PreconditionedNetwork,
     RestingJoints,
     RestingPose,
+    RestingTrend,
     SourceMoments,
     VelocityMLP,
     VelocityNetwork,
@@ -93,7 +93,7 @@ def windows(n=4000, noise=0.1, warm=False):
 
 def fit(batch, prior):
     generator = torch.Generator().manual_seed(0)
-    return PoseTrend.fit(batch, prior, RestingPose(COLUMNS), generator=generator)
+    return RestingTrend.fit(batch, prior, RestingPose(COLUMNS), generator=generator)
 
 
 def test_against_least_squares():
@@ -145,13 +145,13 @@ def test_a_cast_trend_keeps_its_units(dtype):
     normalised = units.normalize(joints)["observation"]
     expected = rest(normalised)
     torch.testing.assert_close(rest.to(dtype)(normalised.to(dtype)).float(), expected, atol=0.02, rtol=0)
-    trend = PoseTrend(rest, torch.zeros(2), torch.zeros(4, 2), torch.ones(4, 2)).to(dtype)
+    trend = RestingTrend(rest, torch.zeros(2), torch.zeros(4, 2), torch.ones(4, 2)).to(dtype)
     assert {part.dtype for part in trend(normalised.to(dtype).unsqueeze(1))} == {dtype}
 
 
 def test_source_and_target_have_one_length():
     with raises(ValueError, "target", "[3, 2]", "[4, 2]"):
-        PoseTrend(RestingJoints([0, 1]), torch.zeros(2), torch.zeros(4, 2), torch.zeros(3, 2))
+        RestingTrend(RestingJoints([0, 1]), torch.zeros(2), torch.zeros(4, 2), torch.zeros(3, 2))
 
 
 JOINTS = [1, 2, -1, 0, 3, 4, 5, 6, 7, -1]
@@ -160,7 +160,7 @@ JOINTS = [1, 2, -1, 0, 3, 4, 5, 6, 7, -1]
 @pytest.mark.parametrize("rest", [RestingPose(COLUMNS, normalizer()), RestingJoints(JOINTS, normalizer())])
 def test_config_and_state_bring_it_back(rest):
     batch, prior = windows(200), GaussianPrior(P)
-    trend = PoseTrend.fit(batch, prior, rest)
+    trend = RestingTrend.fit(batch, prior, rest)
     moments = SourceMoments.fit(batch, prior, trend=trend)
     mlp = VelocityMLP(D_A, D_O, P, TO, hidden_dim=8)
     network = PreconditionedNetwork(mlp, moments=moments, trend=trend)

@@ -7,8 +7,8 @@ pytest.importorskip("scipy")
 from scipy import stats
 
 import warmprior
-from lab.cards import measured
-from lab.report import policy_results
+from lab.reporting.cards import measured
+from lab.reporting.report import policy_results
 from tests.toy_env import mlp_actor
 from warmprior import (
     LinearInterpolant,

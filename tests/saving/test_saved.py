@@ -80,7 +80,7 @@ TRANSFORMER = {"embedding_dim": 12, "num_layers": 2, "num_heads": 2}
         lambda: policy(max_nfe=1, nfe=1),  # regression
         lambda: policy(GaussianPrior(H), observation_key=keys.CONDITIONED, width=D_O + H * D_A + 1),
         lambda: policy(start=Halfway(0.25)),
-        lambda: policy(guidance=RealTimeChunking(2, schedule="ones", jacobian=False, sigma=1.0)),
+        lambda: policy(guidance=RealTimeChunking(2, schedule="linear", jacobian=False, sigma=1.0)),
         lambda: policy(environment={"task": "square"}),
     ],
     ids=range(9),

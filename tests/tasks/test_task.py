@@ -10,12 +10,12 @@ from tensordict import NonTensorStack, TensorDict
 from torchrl.envs import RenameTransform, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from lab.tasks import DataOptions, load_task, longest_of, read_like, title_of
+from lab.demonstrations.tasks import DataOptions, load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
-from warmprior import GaussianPrior, PoseTrend, RestingJoints, keys
+from warmprior import GaussianPrior, RestingJoints, RestingTrend, keys
 from warmprior.data import demonstrations_of, open_demonstrations
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
@@ -127,7 +127,7 @@ def test_absolute_actions_have_the_units_of_deltas(path):
     options = NetworkOptions(hidden_dim=16)
     made = [new_policy(t, GaussianPrior(8), options, TrainingConfig()) for t in (delta, absolute)]
     trends = [actor.network.trend for actor in made]
-    assert trends[0] is None and isinstance(trends[1], PoseTrend)
+    assert trends[0] is None and isinstance(trends[1], RestingTrend)
 
 
 def joint_steps(n=400):

@@ -8,7 +8,7 @@ import dataclasses
 import pytest
 import torch
 
-from lab.tasks import navigation_task
+from lab.demonstrations.tasks import navigation_task
 from tests.rl.training_parts import ALGORITHMS, make_actor, make_training
 from tests.states import copied, same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, training, weights

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lab.learned_sources import ForecastPrior
+from lab.methods.learned_sources import ForecastPrior
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training
 from warmprior import CVAEPrior, ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.training import precondition

@@ -8,7 +8,7 @@ import torch
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from lab.source_errors import mean_revision
+from lab.measures.source_errors import mean_revision
 from tests.errors import raises
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, closing
 from warmprior import GaussianPrior, InferenceDelay, PastPrior, PreviewPrior, keys, policy_transforms

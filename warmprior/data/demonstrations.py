@@ -105,8 +105,8 @@ class Demonstrations:
             parts.append(f"recorded in {kind}'s {described.get('env_name', described.get('id'))}")
         return f"{self}: {'; '.join(parts)}"
 
-    def only(self, demos: int) -> Self:
-        """Return the first of these demonstrations."""
+    def first(self, demos: int) -> Self:
+        """Return the first `demos` of these demonstrations."""
         fewer = copy.copy(self)
         fewer.demos = demos
         return fewer

@@ -170,7 +170,7 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
             raise DatasetError(f"{path}: there are {available} demonstrations, fewer than demos={demos}")
 
 
-def no_such(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetError:
+def unknown_name_error(where: Any, kind: str, name: str, names: Iterable[str]) -> DatasetError:
     """Return the error for a name that is not among those of its kind."""
     return DatasetError(f"{where}: no {kind} {name!r}; there are {', '.join(names) or 'none'}")
 

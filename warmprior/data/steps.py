@@ -141,10 +141,10 @@ def _allocate(
         # alone, also where the end of a worker process calls no other finalizers.
         folder = tempfile.mkdtemp(dir=scratch_dir)
         data = data.memmap_like(folder)
-        left: list[str] = []
+        mapped: list[str] = []
         for value in data.values(True, True):
-            left.append(value.filename)
-            Finalize(value.untyped_storage(), _release, (folder, left), exitpriority=0)
+            mapped.append(value.filename)
+            Finalize(value.untyped_storage(), _release, (folder, mapped), exitpriority=0)
             _reserve(value)
     except OSError as error:
         raise OSError(
@@ -166,10 +166,10 @@ def _reserve(mapped: Any) -> None:
         os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
 
 
-def _release(folder: str, left: list[str]) -> None:
+def _release(folder: str, mapped: list[str]) -> None:
     """Remove a folder after the last of its memory maps; processes that these are sent to open the files."""
-    left.pop()
-    if not left:
+    mapped.pop()
+    if not mapped:
         shutil.rmtree(folder, ignore_errors=True)
 
 

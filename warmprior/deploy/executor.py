@@ -34,7 +34,7 @@ from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
-from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.modules.real_time_chunking import spliced
 from warmprior.transforms.delay import check_delay, usual_execute
 from warmprior.transforms.history import HistoryObservation
 
@@ -293,7 +293,7 @@ class AsyncExecutor:
             return
         if not self._first:
             self._delays.append(self._executed)
-        self._chunk = with_leftover(chunk, self._chunk, torch.tensor([self._executed]))
+        self._chunk = spliced(chunk, self._chunk, torch.tensor([self._executed]))
         self._end, self._pending = len(chunk), None
 
     def _wait(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from tensordict import TensorDictBase
 
-from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, judged, predict
+from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, inputs_and_targets, predict
 from warmprior.modules.actor import WarmPriorActor
 
 
@@ -47,7 +47,7 @@ def action_error(
         [1, 9]
     """
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat, target, rows, generator = judged(policy, windows)
+    flat, target, rows, generator = inputs_and_targets(policy, windows)
     counted = flat["counted"][:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):

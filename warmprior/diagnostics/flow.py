@@ -72,7 +72,7 @@ def check_not_empty(batch: TensorDictBase) -> None:
         raise ValueError(f"the batch has shape {list(batch.batch_size)}: it holds no observation")
 
 
-def judged(
+def inputs_and_targets(
     policy: WarmPriorActor, windows: TensorDictBase
 ) -> tuple[TensorDictBase, Tensor, TensorDictBase, torch.Generator]:
     """Return windows, targets, the policy's inputs, and a generator with a fixed seed."""
@@ -132,7 +132,7 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
     return result
 
 
-def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
+def observe_history(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
     """Update the last actions in a network's observation after the history has changed."""
     return HistoryObservation()(windows) if policy.sees_history else windows
 
@@ -287,23 +287,19 @@ class SharedObservations:
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
     def deployed(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Return windows with the history at deployment, from the policy's own previous prediction.
+        """Return windows as a policy meets them, with the history from its own previous prediction.
 
-        See :func:`deployed_history`. Observations with images are encoded, see :func:`encoded_windows`.
+        See :func:`deployed_history`. A policy that does not depend on the history meets the training windows.
+        Observations with images are encoded, see :func:`encoded_windows`.
         """
         see = policy.sees_history
+        windows = self.windows(policy.prior, see_history=see)
+        trained_on = encoded_windows(policy, windows)
+        if not depends_on_history(policy, trained_on):
+            return trained_on
         earlier = self.windows(policy.prior, offset=self.chunk_length, see_history=see)
-        met = deployed_history(policy, encoded_windows(policy, earlier), generator=generator)
-        windows = self.windows(policy.prior, see_history=see).to(met.device).update(met)
-        return encoded_windows(policy, seen_anew(policy, windows))
-
-    def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Return windows as at deployment: :meth:`deployed`, if the policy depends on the history."""
-        see = policy.sees_history
-        windows = encoded_windows(policy, self.windows(policy.prior, see_history=see))
-        if depends_on_history(policy, windows):
-            return self.deployed(policy, generator=generator)
-        return windows
+        entries = deployed_history(policy, encoded_windows(policy, earlier), generator=generator)
+        return encoded_windows(policy, observe_history(policy, windows.to(entries.device).update(entries)))
 
     def subset(self, index: Tensor) -> SharedObservations:
         """Return the observations with these indices, int64 ``[m]``."""

@@ -18,9 +18,9 @@ from warmprior.diagnostics.flow import (
     allowed_nfes,
     drawn,
     evaluation_mode,
-    judged,
+    inputs_and_targets,
+    observe_history,
     predict,
-    seen_anew,
 )
 from warmprior.diagnostics.statistics import ratio
 from warmprior.modules.actor import WarmPriorActor
@@ -141,7 +141,7 @@ def source_leak(
     """
     check_whole_numbers(2, draws=draws)
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat, target, rows, generator = judged(policy, windows)
+    flat, target, rows, generator = inputs_and_targets(policy, windows)
     n, device, chunk_length = len(flat), flat.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
@@ -251,5 +251,5 @@ class HistoryShift(Drawing, TensorDictModuleBase):
         like = {"dtype": actions.dtype, "device": actions.device, "generator": self.chosen_generator()}
         noise = torch.randn((*actions.shape[:-2], longest, actions.shape[-1]), **like)
         disturbed = tensordict.copy().set(keys.HISTORY, shifted(history, self.std * noise))
-        out = self.policy(seen_anew(self.policy, disturbed))
+        out = self.policy(observe_history(self.policy, disturbed))
         return tensordict.update(out.select(*self.out_keys))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 
@@ -289,8 +289,8 @@ class ControlLoop(StepLoop):
         data = self._data
         self._site_pos, self._site_mat = data.site_xpos, data.site_xmat.reshape(-1, 3, 3)
 
+    @override
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
-        """Advance one control step; see :meth:`StepLoop.step`."""
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         check_shape("action", action, (env.action_dim,))
         for substep in range(self._substeps):

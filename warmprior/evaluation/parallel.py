@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from warmprior.checks import check_whole_numbers
-from warmprior.io.workers import end_with_parent, start_method, worker_died
+from warmprior.io.workers import dead_worker_error, end_with_parent, start_method
 
 
 def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
@@ -132,7 +132,9 @@ def watched(env: EnvBase) -> Iterator[None]:
         except Exception:  # closing fails if workers are dead
             each(lambda worker: worker.terminate())
         if dead:
-            raise worker_died(dead, "run one environment in this process to see its own error") from error
+            raise dead_worker_error(
+                dead, "run one environment in this process to see its own error"
+            ) from error
         raise
     finally:
         finished.set()

@@ -27,7 +27,7 @@ class WorkerError(RuntimeError):
     """
 
 
-def worker_died(worker: str, advice: str) -> WorkerError:
+def dead_worker_error(worker: str, advice: str) -> WorkerError:
     """Return the error with the worker that died, the likely reason, and advice."""
     return WorkerError(
         f"{worker} died. It may have been killed for lack of memory; use fewer workers, or {advice}."

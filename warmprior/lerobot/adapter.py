@@ -15,7 +15,7 @@ from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.ode import Velocity
 from warmprior.modules.prior import Prior
-from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
+from warmprior.modules.real_time_chunking import RealTimeChunking, spliced
 
 
 class RelativeActions:
@@ -203,7 +203,7 @@ class WarmPriorAdapter:
         self._delay = 0
         # The number of actions that predict_action_chunk returned last.
         self._given = 0
-        self._rest: tuple[Tensor, Tensor, Tensor, Tensor]
+        self._guiding: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def action_indices(self) -> list[int]:
@@ -224,7 +224,7 @@ class WarmPriorAdapter:
         """
         check_no_noise(kwargs)
         before, valid, target, is_pad = self._window(with_width(batch, {"action": self.source.action_dim}))
-        a0 = self.source.learn(before, valid, target, self.generator, self.cold_probability)
+        a0 = self.source.draw_for_training(before, valid, target, self.generator, self.cold_probability)
         inputs = dict(batch)
         for name in (HISTORY, HISTORY_IS_PAD):
             inputs.pop(name, None)
@@ -249,7 +249,7 @@ class WarmPriorAdapter:
 
         Raises:
             ValueError: if the number of environments changes without :meth:`reset`, or guidance has no
-                leftover actions, because ``n_action_steps`` is the whole chunk.
+                forecast, because ``n_action_steps`` is the whole chunk.
         """
         steps, length = self.policy.config.n_action_steps, self.prior.prediction_length
         if self.guidance is not None and steps >= length:
@@ -284,8 +284,8 @@ class WarmPriorAdapter:
 
         Raises:
             ValueError: see :meth:`select_action`; also if the number of executed actions is unknown or
-                exceeds the chunk, the leftover is not part of the last chunk, or it is shorter than the
-                delay.
+                exceeds the chunk, ``prev_chunk_left_over`` is not part of the last chunk, or it is shorter
+                than the delay.
         """
         call = self.policy.predict_action_chunk if predict is None else predict
         if self._sampling:  # on the way from select_action
@@ -294,8 +294,8 @@ class WarmPriorAdapter:
         if executed_steps is not None:
             self._memory.executed(executed_steps)
         elif LEFT_OVER in kwargs:
-            left = self._memory.left_over(kwargs[LEFT_OVER], self._given)
-            delay = min(kwargs.get("inference_delay") or 0, left)
+            forecast_steps = self._memory.infer_executed(kwargs[LEFT_OVER], self._given)
+            delay = min(kwargs.get("inference_delay") or 0, forecast_steps)
         check_whole_numbers(0, delay=delay)
         self._delay = delay
         try:
@@ -351,15 +351,14 @@ class WarmPriorAdapter:
             yield
 
     def _guided(self, velocity: Velocity) -> Velocity:
-        """Return a velocity of the whole chunk, guided towards the rest of the last one."""
+        """Return a velocity of the whole chunk, guided towards the forecast of the last one."""
         assert self.guidance is not None
-        rest, left, delay, scale = self._rest
-        return self.guidance.guided(velocity, rest, left, delay, scale)
+        return self.guidance.guided(velocity, *self._guiding)
 
     def _spliced(self, chunk: Tensor) -> Tensor:
         """Return a chunk whose first actions, until it takes effect, are those of the last chunk."""
-        rest, _, delay, _ = self._rest
-        return with_leftover(chunk, rest[:, : chunk.shape[1], : chunk.shape[2]], delay)
+        forecast, _, delay, _ = self._guiding
+        return spliced(chunk, forecast[:, : chunk.shape[1], : chunk.shape[2]], delay)
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         length, history, lead = self.source.length, self.prior.history_length, self.source.lead
@@ -394,19 +393,19 @@ class WarmPriorAdapter:
                 return relative.reanchor(actions, before, now)
 
         history = self._memory.decide(shape[0], device, move)
-        source, left = self.source.distribution(history), history["forecast_steps"]
+        source, forecast_steps = self.source.distribution(history), history["forecast_steps"]
         values = source.sample(self.generator), source.scale
         a0, scale = (self.source.scaled(value, source.warm) for value in values)
-        delay = torch.where(left > 0, self._delay, 0)
+        delay = torch.where(forecast_steps > 0, self._delay, 0)
         if self._delay and self.source.lead:
             raise ValueError("delay is for policies whose chunk begins at the current step: leave it out")
-        going_on = left[~self._memory.began]
+        going_on = forecast_steps[~self._memory.began]
         if self._delay and len(going_on):
             (self.guidance or RealTimeChunking()).check_reach(self._delay, int(going_on.min()))
-        rest, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
+        forecast, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
         predicted = (..., self.source.positions, slice(self.source.action_dim))
-        rest[predicted], width[predicted] = history["forecast"].to(dtype), scale
-        self._rest = rest, left, delay, width
+        forecast[predicted], width[predicted] = history["forecast"].to(dtype), scale
+        self._guiding = forecast, forecast_steps, delay, width
         return self.source.place(a0, self.generator).to(dtype)
 
     def _record(self, actions: Tensor) -> None:

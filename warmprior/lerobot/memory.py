@@ -86,23 +86,24 @@ class ActionMemory:
         """Count one more executed action of the chunk."""
         self._executed, self._counted = self._executed + 1, True
 
-    def left_over(self, rest: Tensor | None, given: int) -> int:
-        """Infer the number of executed actions from the rest of the chunk; return the smallest rest.
+    def infer_executed(self, left_over: Tensor | None, given: int) -> int:
+        """Infer the number of executed actions from those left over; return how many are left.
 
-        The policy returned the first ``given`` actions of the chunk. The rest is ``[B, n, d_a]``, or
+        The policy returned the first ``given`` actions of the chunk. Those left over are ``[B, n, d_a]``, or
         ``[n, d_a]`` for one environment: any number of actions from the next one on, with zeros after the
-        last. ``None`` stands for a new episode, as in LeRobot's rollouts. Raises ValueError if the rest is
-        not part of the chunk.
+        last. ``None`` stands for a new episode, as in LeRobot's rollouts. Raises ValueError if they are not
+        part of the chunk. The number returned is the smallest of all environments.
         """
-        if rest is None:
+        if left_over is None:
             self.forget()
-        if rest is None or self._chunk is None:
+        if left_over is None or self._chunk is None:
             return 0
-        rest = (rest if rest.ndim == 3 else rest[None])[..., : self.action_dim].to(self._chunk)
-        count = rest.shape[1]
+        left_over = (left_over if left_over.ndim == 3 else left_over[None])[..., : self.action_dim]
+        left_over = left_over.to(self._chunk)
+        count = left_over.shape[1]
         line = pad(self._chunk[:, :given], (0, 0, 0, count))
         first = 0 if count else given
-        same = [(line[:, k : k + count] == rest).flatten(1).all(1) for k in range(first, given + 1)]
+        same = [(line[:, k : k + count] == left_over).flatten(1).all(1) for k in range(first, given + 1)]
         begins = torch.stack(same, 1)
         if not begins.any(1).all():
             raise ValueError(

@@ -66,7 +66,7 @@ class ChunkSource:
         source = self.distribution(history)
         return self.scaled(source.sample(generator), source.warm)
 
-    def learn(
+    def draw_for_training(
         self,
         before: Tensor,
         valid: Tensor,

@@ -12,7 +12,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.transformers import AdaLNTransformer, ChiTransformer
-from warmprior.modules.trend import PoseTrend, RestingAction, RestingJoints, RestingPose
+from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose, RestingTrend
 
 __all__ = [
     "AdaLNTransformer",
@@ -26,7 +26,6 @@ __all__ = [
     "ODEActor",
     "PastPrior",
     "PlainMLP",
-    "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
@@ -35,6 +34,7 @@ __all__ = [
     "RestingAction",
     "RestingJoints",
     "RestingPose",
+    "RestingTrend",
     "Sampling",
     "Source",
     "SourceMoments",

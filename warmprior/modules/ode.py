@@ -77,12 +77,6 @@ DEFAULT_NFE = 3
 MAX_NFE = 10_000
 """The largest ``nfe``: more would take minutes per chunk, and look like a process that hangs."""
 
-GUIDED_BY_WHOM = (
-    ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
-    "delay=0), and by AsyncExecutor on a robot"
-)
-
-
 SOLVERS: dict[str, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] = {
     "euler": (((),), (1.0,)),
     "midpoint": (((), (0.5,)), (0.0, 1.0)),
@@ -240,8 +234,8 @@ class ODEActor(TensorDictModuleBase):
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
             observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
         start_time: where integration starts, see :func:`integrate`.
-        guidance: makes chunks continue the one being executed. It reads the rest of that chunk, the
-            history's ``"forecast"`` and ``"forecast_steps"``, and the delay.
+        guidance: makes chunks continue the one being executed. It reads the history's
+            ``"forecast"`` and ``"forecast_steps"``, what is left of that chunk, and the delay.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         history_key: key of the history, which guidance reads.
         source_key: parent key of the source sample, ``(source_key, "noise")``, ``[*B, P, d_a]``.
@@ -290,8 +284,8 @@ class ODEActor(TensorDictModuleBase):
         self.observation_key = observation_key
         self.in_keys = [unravel_key((source_key, "noise")), observation_key]
         if guidance is not None:
-            rest = [unravel_key((history_key, name)) for name in ("forecast", "forecast_steps")]
-            self.in_keys += [*rest, keys.DELAY]
+            forecast = [unravel_key((history_key, name)) for name in ("forecast", "forecast_steps")]
+            self.in_keys += [*forecast, keys.DELAY]
         self.out_keys = [chunk_key]
 
     @dispatch(auto_batch_size=False)
@@ -302,16 +296,20 @@ class ODEActor(TensorDictModuleBase):
         values: list[Any] = [tensordict.get(key, None) for key in self.in_keys]
         if any(value is None for value in values):
             check_keys(tensordict, self.in_keys[:2], "ODEActor")
-            check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
-        a0, observation, *rest = values
+            writers = (
+                ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
+                "delay=0), and by AsyncExecutor on a robot"
+            )
+            check_keys(tensordict, self.in_keys[2:], "ODEActor", writers)
+        a0, observation, *guiding = values
         velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:
-            leftover, left, delay = rest
+            forecast, forecast_steps, delay = guiding
             scale = torch.ones_like(a0) if sigma is None else sigma.expand_as(a0)
             velocity = self.guidance.guided(
                 velocity,
-                leftover.reshape(-1, *a0.shape[-2:]).to(a0.dtype),
-                left.reshape(-1, 1),
+                forecast.reshape(-1, *a0.shape[-2:]).to(a0.dtype),
+                forecast_steps.reshape(-1, 1),
                 delay.reshape(-1, 1),
                 scale.reshape(-1, *a0.shape[-2:]),
             )

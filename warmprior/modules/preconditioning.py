@@ -17,7 +17,7 @@ from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.modules.trend import VARIANCE_FLOOR, PoseTrend, vector_of
+from warmprior.modules.trend import VARIANCE_FLOOR, RestingTrend, vector_of
 
 CORRELATION_LIMIT = 1 - 1e-6
 """The largest correlation; above it source and target determine each other."""
@@ -116,7 +116,7 @@ class SourceMoments(nn.Module):
         *,
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         samples: int = 16_384,
-        trend: PoseTrend | None = None,
+        trend: RestingTrend | None = None,
         slope: Slope = "marginal",
         observation_key: NestedKey = keys.OBSERVATION,
         generator: torch.Generator | None = None,
@@ -256,7 +256,7 @@ class PreconditionedNetwork(VelocityNetwork):
         network: VelocityNetwork | dict[str, Any],
         *,
         moments: SourceMoments | dict[str, Any] | None = None,
-        trend: PoseTrend | dict[str, Any] | None = None,
+        trend: RestingTrend | dict[str, Any] | None = None,
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
         if isinstance(network, dict):
@@ -279,7 +279,7 @@ class PreconditionedNetwork(VelocityNetwork):
         if not isinstance(moments, SourceMoments):
             moments = SourceMoments.identity(*shape, **(moments or {}))
         self.moments = moments
-        self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
+        self.trend = RestingTrend.zero(**trend) if isinstance(trend, dict) else trend
         check_shape("a moment for the network's chunks", self.moments.covariance, shape)
         if self.trend is not None:
             check_shape("the trend for the network's chunks", self.trend.target, shape)

@@ -1,4 +1,4 @@
-"""Real-Time Chunking: guidance of a flow towards the rest of the chunk being executed."""
+"""Real-Time Chunking: guidance of a flow towards the forecast of the chunk being executed."""
 
 from __future__ import annotations
 
@@ -17,21 +17,19 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
     "exp": lambda linear: linear * torch.expm1(linear) / (math.e - 1),
     "linear": lambda linear: linear,
-    "ones": torch.ones_like,
-    "zeros": lambda linear: (linear >= 1).to(linear),
 }
 """Schedules of the weight after the delay, by name; each is a function of a weight that falls linearly."""
 
-Schedule = Literal["exp", "linear", "ones", "zeros"]
+Schedule = Literal["exp", "linear"]
 
 
-def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
-    """Return a late chunk ``[*B, P, d_a]`` as it is executed: its first ``delay`` actions from the leftover.
+def spliced(chunk: Tensor, forecast: Tensor, delay: Tensor) -> Tensor:
+    """Return a late chunk ``[*B, P, d_a]`` as it is executed: its first ``delay`` actions from the forecast.
 
-    The leftover is the previous chunk at the same control steps, ``[*B, P, d_a]``; the delay is ``[*B, 1]``.
+    The forecast is the previous chunk at the same control steps, ``[*B, P, d_a]``; the delay is ``[*B, 1]``.
     """
     late = torch.arange(chunk.shape[-2], device=chunk.device) < delay
-    return torch.where(late.unsqueeze(-1), leftover.to(chunk.dtype), chunk)
+    return torch.where(late.unsqueeze(-1), forecast.to(chunk.dtype), chunk)
 
 
 @dataclass(frozen=True)
@@ -39,15 +37,15 @@ class RealTimeChunking:
     r"""The guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
 
     While a chunk is computed, the old one is executed for ``d`` more control steps (the delay), and the new
-    one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old chunk, with
+    one should continue it. Velocities are corrected towards its forecast :math:`Y` of the same steps, with
     :math:`\hat a = a_t + (1-t)\,v(t, a_t)` and :math:`J = \partial \hat a / \partial a_t`:
 
     .. math::
         v' = v + \min\!\big(g(t), \beta\big)\; J^\top W (Y - \hat a), \qquad
-        g(t) = \frac{\sigma^2}{S^2} \frac{1-t}{t} + \frac{t}{1-t}.
+        g(t) = \sigma^2\, \frac{1-t}{t} + \frac{t}{1-t}.
 
-    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation :math:`S`
-    (docs/real_time_chunking.md derives it). :math:`\sigma = S = 1` is the published weight,
+    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation 1
+    (docs/real_time_chunking.md derives it). :math:`\sigma = 1` is the published weight,
     :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
     (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the first ``d`` positions, at which the old
     chunk is executed, then falls as ``schedule`` says, and is 0 from ``horizon`` on.
@@ -55,14 +53,12 @@ class RealTimeChunking:
     Args:
         horizon: first position without guidance (LeRobot's execution_horizon, the official code's
             prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
-        schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
+        schedule: "exp" (the official default) or "linear" (LeRobot's).
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
         jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and
             takes 0.6 of the time, but is no longer exact in the Gaussian case.
         sigma: the source's standard deviation in the weight; by default that of the policy's source. 1 gives
             the published weight.
-        data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
-            POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
 
     Raises:
         ValueError: if the schedule is unknown, or a number is out of range.
@@ -82,31 +78,33 @@ class RealTimeChunking:
     max_guidance_weight: float = 5.0
     jacobian: bool = True
     sigma: float | None = None
-    data_std: float = 1.0
 
     def __post_init__(self) -> None:
         check_choice("schedule", self.schedule, SCHEDULES)
         check_whole_numbers(**given(horizon=self.horizon))
-        check_positive(max_guidance_weight=self.max_guidance_weight, data_std=self.data_std)
+        check_positive(max_guidance_weight=self.max_guidance_weight)
         check_not_negative(**given(sigma=self.sigma))
 
-    def check_reach(self, delay: int, left: int) -> None:
-        """Raise ValueError if the delay exceeds the horizon, or the rest of the old chunk."""
-        if not 0 <= delay <= left:
+    def check_reach(self, delay: int, forecast_steps: int) -> None:
+        """Raise ValueError if the delay exceeds the horizon, or the steps that the old chunk covers."""
+        if not 0 <= delay <= forecast_steps:
             raise ValueError(
-                f"a delay of {delay} control steps needs as many actions of the old chunk, but only {left} "
-                "are left: execute fewer actions per decision, or predict longer chunks"
+                f"a delay of {delay} control steps needs as many actions of the old chunk, but only "
+                f"{forecast_steps} are left: execute fewer actions per decision, or predict longer chunks"
             )
         if self.horizon is not None and self.horizon < delay:
             raise ValueError(
                 f"the guidance ends at horizon={self.horizon}, before the delay of {delay} control steps "
-                f"ends: set horizon >= delay, or None for all {left} actions that are left"
+                f"ends: set horizon >= delay, or None for all {forecast_steps} actions that are left"
             )
 
-    def weights(self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None) -> Tensor:
-        """Return the weights :math:`W` ``[*B, P]`` for a delay and ``left`` positions, int64 ``[*B]``."""
+    def weights(
+        self, delay: Tensor, forecast_steps: Tensor, length: int, dtype: torch.dtype | None = None
+    ) -> Tensor:
+        """Return the weights :math:`W` ``[*B, P]`` for a delay and steps of the forecast, int64 ``[*B]``."""
         i = torch.arange(length, device=delay.device)
-        end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
+        end = forecast_steps if self.horizon is None else forecast_steps.clamp(max=self.horizon)
+        end = end.unsqueeze(-1)
         start = torch.minimum(delay.unsqueeze(-1), end)
         linear = ((start - 1 - i).to(dtype or torch.get_default_dtype()) / (end - start + 1) + 1).clamp(0, 1)
         return torch.where(i < end, SCHEDULES[self.schedule](linear), 0.0)
@@ -116,21 +114,27 @@ class RealTimeChunking:
         if self.sigma is not None:
             sigma = self.sigma
         tiny = torch.finfo(t.dtype).tiny
-        source = (sigma / self.data_std) ** 2 * ((1 - t) / t.clamp(min=tiny))
+        source = sigma**2 * ((1 - t) / t.clamp(min=tiny))
         data = t / (1 - t).clamp(min=tiny)
         return (source + data).clamp(max=self.max_guidance_weight)
 
     def guided(
-        self, velocity: Velocity, leftover: Tensor, left: Tensor, delay: Tensor, sigma: Tensor | float = 1.0
+        self,
+        velocity: Velocity,
+        forecast: Tensor,
+        forecast_steps: Tensor,
+        delay: Tensor,
+        sigma: Tensor | float = 1.0,
     ) -> Velocity:
-        """Return a velocity that makes chunks continue the leftover, or ``velocity`` if no row has one.
+        """Return a velocity that makes chunks continue the forecast, or ``velocity`` if no row has one.
 
         It works under ``torch.no_grad()``, and its result is detached.
 
         Args:
             velocity: the field ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
-            leftover: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
-            left: number of its first positions that count, int64 ``[B, 1]``. Rows with 0 are not guided.
+            forecast: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
+            forecast_steps: number of its first positions that count, int64 ``[B, 1]``. Rows with 0 are not
+                guided.
             delay: ``d``, int64 ``[B, 1]``.
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
 
@@ -138,24 +142,24 @@ class RealTimeChunking:
             ValueError: if the shapes do not fit, or the delay is too long (:meth:`check_reach`).
             RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
         """
-        rows, length = leftover.shape[:2]
-        if not left.shape == delay.shape == (rows, 1):
+        rows, length = forecast.shape[:2]
+        if not forecast_steps.shape == delay.shape == (rows, 1):
             raise ValueError(
-                f"the leftover [B, P, d_a] has shape {tuple(leftover.shape)}: left and delay have to be "
-                f"[B, 1], got {tuple(left.shape)} and {tuple(delay.shape)}"
+                f"the forecast [B, P, d_a] has shape {tuple(forecast.shape)}: forecast_steps and delay have "
+                f"to be [B, 1], got {tuple(forecast_steps.shape)} and {tuple(delay.shape)}"
             )
-        left, delay = left.squeeze(1), delay.squeeze(1)
-        if not left.any():
+        steps, delay = forecast_steps.squeeze(1), delay.squeeze(1)
+        if not steps.any():
             return velocity
-        for late, count in torch.stack([delay, left], 1)[left > 0].unique(dim=0).tolist():
+        for late, count in torch.stack([delay, steps], 1)[steps > 0].unique(dim=0).tolist():
             self.check_reach(late, count)
-        weights = self.weights(delay, left, length, leftover.dtype).unsqueeze(-1)
+        weights = self.weights(delay, steps, length, forecast.dtype).unsqueeze(-1)
 
         def corrected(t: Tensor, a: Tensor) -> Tensor:
-            rest = (1 - t)[:, None, None]
+            remaining = (1 - t)[:, None, None]
             if not self.jacobian:
                 v = velocity(t, a)
-                correction = weights * (leftover - (a + rest * v))
+                correction = weights * (forecast - (a + remaining * v))
             else:
                 if torch.is_inference_mode_enabled():
                     raise RuntimeError(
@@ -165,8 +169,8 @@ class RealTimeChunking:
                 with torch.enable_grad():
                     point = a.detach().requires_grad_(True)
                     v = velocity(t, point)
-                    clean = point + rest * v
-                    error = (weights * (leftover - clean)).detach()
+                    clean = point + remaining * v
+                    error = (weights * (forecast - clean)).detach()
                     (correction,) = torch.autograd.grad(clean, point, error)
             v = v.detach()
             return v + self.guidance_weight(t[:, None, None], sigma) * correction

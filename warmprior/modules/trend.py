@@ -149,7 +149,7 @@ class RestingJoints(RestingAction):
         return int(targets.nonzero()[(off / spread.clamp_min(VARIANCE_FLOOR)).argmax()])
 
 
-class PoseTrend(nn.Module):
+class RestingTrend(nn.Module):
     """Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
 
     Absolute poses and joint targets lie near the present ones, which explain most of their variance. A
@@ -170,9 +170,9 @@ class PoseTrend(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from warmprior import PoseTrend, RestingPose
+        >>> from warmprior import RestingTrend, RestingPose
         >>> rest = RestingPose(torch.arange(7)[None])
-        >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
+        >>> trend = RestingTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
         >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
         >>> source, target = trend(observation)  # the targets follow the gripper, the source does not
         >>> source.abs().max(), target[1, 3, :3]
@@ -193,7 +193,7 @@ class PoseTrend(nn.Module):
         self.centre, self.source, self.target = (nn.Buffer(v.clone()) for v in (centre, source, target))
 
     @classmethod
-    def zero(cls, rest: dict[str, Any], prediction_length: int) -> PoseTrend:
+    def zero(cls, rest: dict[str, Any], prediction_length: int) -> RestingTrend:
         """Return a trend of zeros, to be replaced by loading a state dict."""
         made = from_config(RestingAction, rest)
         none = torch.zeros(prediction_length, made.width)
@@ -208,7 +208,7 @@ class PoseTrend(nn.Module):
         rest: RestingAction,
         *,
         generator: torch.Generator | None = None,
-    ) -> PoseTrend:
+    ) -> RestingTrend:
         """Estimate a trend from unpadded positions of windows ``[N]`` and draws of the prior.
 
         The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator

@@ -110,7 +110,7 @@ class PriorSpaceConfig:
                 f"warmup_steps ({self.warmup_steps}) exceed environment_steps ({self.environment_steps})"
             )
 
-    def box(self, actor: WarmPriorActor) -> float:
+    def delta_for(self, actor: WarmPriorActor) -> float:
         """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
         return self.delta or (0.5 if has_anchor(actor) else 1.5)
 
@@ -144,7 +144,7 @@ class PriorSpaceAgent:
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
         self.config = config
         self.device = next(actor.parameters()).device
-        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=config.box(actor))
+        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=config.delta_for(actor))
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
         drawn: Literal["clipped"] | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)

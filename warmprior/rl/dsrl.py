@@ -40,11 +40,6 @@ CRITICS = 2
 STEPS = "steps_to_next_obs"
 """TorchRL's key of the decisions up to the next state, which its ``MultiStep`` writes."""
 
-ELSEWHERE = (
-    ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
-    "set_keys(chunk=...)"
-)
-
 
 class DSRLNALoss(LossModule):
     r"""The loss of noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_).
@@ -244,7 +239,11 @@ class DSRLNALoss(LossModule):
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses of actor, temperature and action critic on transitions; write the TD errors."""
-        check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
+        elsewhere = (
+            ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
+            "set_keys(chunk=...)"
+        )
+        check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, elsewhere)
         self._check_next_states(tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()

@@ -61,7 +61,7 @@ def model_card(
         "## Success",
         success,
         "## Use",
-        _use(actor, repository, playable=name is not None),
+        _usage(actor, repository, playable=name is not None),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -90,7 +90,7 @@ def _facts(actor: WarmPriorActor) -> dict[str, str]:
     }
 
 
-def _use(actor: WarmPriorActor, repository: str, playable: bool) -> str:
+def _usage(actor: WarmPriorActor, repository: str, playable: bool) -> str:
     path = getattr(actor.network, "interpolant", None)
     own = dict.fromkeys(
         f"{type(part).__name__} of {type(part).__module__}"

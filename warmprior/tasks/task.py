@@ -105,7 +105,7 @@ class Task:
         facts: facts about the data for results, as JSON.
         adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
-        rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
+        rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.RestingTrend`.
         resize: how the images were resized, see :func:`~warmprior.modules.resize.resized`.
         clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for no bound.
         environment: the description of the environment that a saved policy keeps, see

@@ -22,7 +22,7 @@ from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, Slope, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import PoseTrend, RestingAction
+from warmprior.modules.trend import RestingAction, RestingTrend
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.saving.policies import load_policy
 from warmprior.tasks.task import Task
@@ -229,7 +229,7 @@ def _task_of(demonstrations: Any, chosen: dict[str, Any]) -> Task:
 
 
 TREND_BATCHES = 16
-"""The number of batches of 1,024 windows to which a :class:`PoseTrend` is fitted."""
+"""The number of batches of 1,024 windows to which a :class:`RestingTrend` is fitted."""
 
 
 def precondition(
@@ -281,7 +281,7 @@ def precondition(
     trend = None
     if rest is not None:
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
-        trend = PoseTrend.fit(batch, prior, rest, generator=generator)
+        trend = RestingTrend.fit(batch, prior, rest, generator=generator)
     moments = SourceMoments.fit(
         windows, prior, coupling=coupling, trend=trend, slope=slope, generator=generator
     )

@@ -122,7 +122,7 @@ class LateTransforms:
             inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
             for transform in self._inverse:
                 inputs = transform._inv_call(inputs)
-            results.append(self._step.bare(inputs))
+            results.append(self._step.base_step(inputs))
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
         return results

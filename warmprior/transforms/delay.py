@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec, Unbounded
 from warmprior import keys
 from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.modules.prior import Prior
-from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.modules.real_time_chunking import spliced
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
 
 
@@ -46,7 +46,7 @@ def executed_chunk(
 ) -> Tensor:
     """Return the chunks of decisions ``[*B]`` as they are executed.
 
-    A late chunk begins with the rest of the one before; without a recorded delay, chunks do not change.
+    A late chunk begins with the forecast of the one before; without a recorded delay, chunks do not change.
 
     Examples:
         >>> import torch
@@ -62,7 +62,7 @@ def executed_chunk(
     if delay is None:
         return tensordict.get(chunk_key)
     forecast = tensordict.get(unravel_key((history_key, "forecast")))
-    return with_leftover(tensordict.get(chunk_key), forecast, delay)
+    return spliced(tensordict.get(chunk_key), forecast, delay)
 
 
 class InferenceDelay(EnvTransform):

@@ -113,7 +113,7 @@ class InnerStep:
             set_aside(tensordict, self.observed)
         for transform in reversed(self.transforms):
             tensordict = transform._inv_call(tensordict)
-        result = self.bare(tensordict)
+        result = self.base_step(tensordict)
         if rows is not None and self.restarts.native:
             done, ended = (place.get("done").view_as(rows) for place in (result, tensordict))
             if last or not (rows & ~done).any():
@@ -123,7 +123,7 @@ class InnerStep:
             result = transform._step(tensordict, result)
         return result
 
-    def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def base_step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the result of a step ``[*B]`` of the environment itself, with all its flags."""
         # Cloned, because an environment may write the next one into the same memory.
         result = self.base._step(tensordict).clone()

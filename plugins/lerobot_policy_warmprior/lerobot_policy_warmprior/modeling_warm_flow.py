@@ -26,10 +26,10 @@ from warmprior import (
     FlowMatchingLoss,
     ImageEncoder,
     Normalizer,
-    PoseTrend,
     PreconditionedNetwork,
     Prior,
     RestingJoints,
+    RestingTrend,
     VelocityNetwork,
     VisionNetwork,
     WarmPriorActor,
@@ -175,7 +175,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         if dataset_meta is None:
             if key not in ("", "auto"):
                 resting = RestingJoints(self.config.joint_columns(key))
-                trend = PoseTrend.zero(resting.config(), prior.prediction_length)
+                trend = RestingTrend.zero(resting.config(), prior.prediction_length)
             return PreconditionedNetwork(network, trend=trend)
         mode = self.config.normalization_mapping.get("ACTION")
         if mode != NormalizationMode.MIN_MAX:

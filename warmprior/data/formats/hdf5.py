@@ -28,9 +28,9 @@ from warmprior.data.index import (
     check_count,
     check_env_args,
     declared_poses,
-    no_such,
     pose_keys,
     store_finite,
+    unknown_name_error,
 )
 from warmprior.envs.tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
@@ -183,7 +183,7 @@ def _mask_names(file: h5py.File) -> list[str]:
 
 def _mask(file: h5py.File, filter_key: str) -> set[str]:
     if filter_key not in (masks := _mask_names(file)):
-        raise no_such(file.filename, "filter key", filter_key, masks)
+        raise unknown_name_error(file.filename, "filter key", filter_key, masks)
     entries, demos = member(file["mask"], filter_key, "dataset"), len(names(file["data"]))
     what = f"{file.filename}: mask/{filter_key}"
     if entries is None or entries.ndim != 1 or entries.dtype.kind not in "SO":
@@ -239,7 +239,7 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
             continue
         if dataset is None:
             kind, group = ("observation", observations) if key.startswith("obs/") else ("dataset", demo)
-            raise no_such(what, kind, key.removeprefix("obs/"), names(group))
+            raise unknown_name_error(what, kind, key.removeprefix("obs/"), names(group))
         shape: tuple[int, ...] = dataset.shape or ()
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0 or shape[:1] != (steps,):
@@ -274,7 +274,7 @@ def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str
                     f"{_place(demo)} has no images: leave the images out, or render them from its states "
                     "(python benchmarks/demonstrations.py render)"
                 )
-            raise no_such(_place(demo), "images", key, others)
+            raise unknown_name_error(_place(demo), "images", key, others)
         shape: tuple[int, ...] = images.shape or ()
         rows, *size, colours = shape if len(shape) == 4 else (0, 0, 0)
         if images.dtype != "uint8" or (rows, colours) != (steps, 3) or not min(size):
@@ -313,8 +313,8 @@ class RobomimicReader(DemonstrationReader):
                 block = images[start : start + rows]
             yield torch.from_numpy(block).permute(0, 3, 1, 2)
 
+    @override
     def name(self, demo: str, key: str) -> str:
-        """Return the name of a demo's array for errors."""
         return f"{self.file.filename}: data/{demo}/{key}"
 
 

@@ -99,8 +99,8 @@ class LeRobotReader(DemonstrationReader):
             return "action", slice(None)
         return self.index.columns[key.removeprefix("obs/")]
 
+    @override
     def name(self, demo: str, key: str) -> str:
-        """Return the name of an episode's array for errors, with the file that holds it."""
         file = episode_file(self.index.metadata, self._episodes[demo])
         feature, observation = self._place(key)[0], key.removeprefix("obs/")
         inside = f" ({observation})" if key != observation != feature else ""

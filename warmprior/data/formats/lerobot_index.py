@@ -16,9 +16,9 @@ from warmprior.data.index import (
     check_count,
     check_env_args,
     declared_poses,
-    no_such,
     pose_keys,
     reading,
+    unknown_name_error,
 )
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
@@ -254,7 +254,7 @@ def read_lerobot_index(
         if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint", "bool"))
     }
     if "action" not in widths:
-        raise no_such(root, "vector of numbers", "action", widths)
+        raise unknown_name_error(root, "vector of numbers", "action", widths)
     if recorded:
         _check_actions(root, metadata, recorded, task)
     named = _named_columns(root, metadata.features, widths, described, task)
@@ -276,7 +276,7 @@ def read_lerobot_index(
             )
         if key not in columns:
             options = [name for name in columns if name in named or name.startswith("observation")]
-            raise no_such(root, "observation", key, options)
+            raise unknown_name_error(root, "observation", key, options)
     cameras = camera_images(name for name in metadata.camera_keys if name not in metadata.depth_keys)
     own = {feature: image for image, feature in cameras.items()}  # LeRobot's own names are known as well
     images = [own.get(name, name) for name in images]
@@ -288,7 +288,7 @@ def read_lerobot_index(
     if mask is not None:
         masks = described.get("masks", {})
         if mask not in masks:
-            raise no_such(root, "filter key", mask, masks)
+            raise unknown_name_error(root, "filter key", mask, masks)
         chosen = _chosen(root, f"the mask {mask!r}", masks[mask], count)
         if not chosen:
             raise DatasetError(f"{root}: the mask {mask!r} names no episode: choose another, or none")
@@ -421,7 +421,7 @@ def _image_shape(
 ) -> tuple[int, int]:
     """Return height and width of an image as it is stored."""
     if key not in cameras:
-        raise no_such(root, "images", key, cameras)
+        raise unknown_name_error(root, "images", key, cameras)
     match features[cameras[key]]["shape"]:
         case (3, height, width) | (height, width, 3) if min(height, width) > 0:
             return height, width

@@ -19,9 +19,9 @@ from warmprior.data.index import (
     DatasetIndex,
     DemonstrationReader,
     check_count,
-    no_such,
     reading,
     store_finite,
+    unknown_name_error,
 )
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
@@ -160,7 +160,7 @@ class MinariDemonstrations(Demonstrations):
         for kind, wanted, present in (("observation", chosen, vectors), ("image", images, pictures)):
             for key in wanted:
                 if key not in present:
-                    raise no_such(where, kind, key, present)
+                    raise unknown_name_error(where, kind, key, present)
         check_count(where, self.demos, dataset.total_episodes)
         episodes = [int(i) for i in dataset.episode_indices][: self.demos]
         with reading(f"{where}: its episodes", _AGAIN):

@@ -1,0 +1,1 @@
+"""Tasks, and the sources of their demonstrations: official files, scripted experts, rendered images."""

@@ -1,0 +1,169 @@
+"""Demonstration files from the scripted experts, generated in parallel and reproducibly."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from torchrl._utils import logger
+from tqdm import tqdm
+
+from lab.demonstrations.scripted.episode import (
+    Episode,
+    expert_loop,
+    operator_of,
+    run_episode,
+    write_robomimic,
+)
+from lab.demonstrations.scripted.operators import OPERATORS
+from lab.demonstrations.scripted.tasks import EXPERTS
+from lab.io.files import cache_folder
+from lab.io.workers import available_cores, working
+from warmprior.envs.control_loop import ControlLoop
+from warmprior.envs.simulator import import_robosuite, task_env_args
+from warmprior.envs.tasks import EVALUATION_SEED, get_task
+from warmprior.io.extras import require
+
+#: Part of every cached file's name; raised when the same arguments give other demonstrations.
+GENERATOR_VERSION = 1
+#: The file of a ``seed`` uses at most this many simulator seeds, from ``seed * SEEDS_PER_FILE`` on.
+SEEDS_PER_FILE = 100_000
+_STYLES = ("ph", "mh")
+
+
+def generate_demonstrations(
+    task: str,
+    style: str = "ph",
+    n: int = 200,
+    seed: int = 0,
+    *,
+    path: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+) -> Path:
+    """Generate successful scripted demonstrations in robomimic's HDF5 layout, and return the file's path.
+
+    The file has states; :func:`lab.demonstrations.render.render_demonstrations` renders images from them.
+
+    Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
+    kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
+    official files. The content does not depend on the number of workers. All seeds are smaller
+    than :data:`~warmprior.envs.tasks.EVALUATION_SEED`.
+
+    Args:
+        task: ``lift``, ``can``, ``square``, ``stack`` or ``transport``.
+        style: ``"ph"`` for one skilled operator, ``"mh"`` for six operators with three levels of skill.
+        n: number of demonstrations.
+        seed: 0 to 99; files of different seeds share no episode.
+        path: file to write. ``None`` for the cache (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if
+            that is not set), from which a file generated earlier with the same arguments is returned at once.
+        overwrite: replace an existing file.
+        workers: number of processes; ``None`` for one per available core.
+
+    Raises:
+        FileExistsError: if ``path`` exists.
+        ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
+        RuntimeError: if the experts fail too often to reach ``n``.
+
+    Examples:
+        >>> from lab.demonstrations.scripted.generate import generate_demonstrations
+        >>> path = generate_demonstrations("lift", n=20)  # doctest: +SKIP
+        >>> path.name  # doctest: +SKIP
+        'lift_ph_n20_seed0_v1.hdf5'
+        >>> generate_demonstrations("tool_hang")
+        Traceback (most recent call last):
+            ...
+        ValueError: there is no scripted expert for 'tool_hang'; only its official data exist: ...
+    """
+    get_task(task)
+    if task not in EXPERTS:
+        raise ValueError(
+            f"there is no scripted expert for {task!r}; only its official data exist: fetch them "
+            "(download_robomimic, or --download)"
+        )
+    if style not in _STYLES:
+        raise ValueError(f"style is {' or '.join(map(repr, _STYLES))}, got {style!r}")
+    last_seed = EVALUATION_SEED // SEEDS_PER_FILE - 1
+    if not 0 <= seed <= last_seed:
+        raise ValueError(f"seed must be between 0 and {last_seed}, got {seed}")
+    for name, value in {"n": n, "workers": workers}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    if n > SEEDS_PER_FILE:
+        raise ValueError(f"n must be at most {SEEDS_PER_FILE:,}, the seeds of a file, got {n}")
+    if path is None:
+        name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
+        path = cache_folder() / "scripted" / name
+        if path.exists():
+            return path
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
+    require("h5py", "sim")
+    import_robosuite()
+    workers = min(n, workers or available_cores())
+    with working(workers, task) as call, tqdm(total=n, desc=f"{task}/{style}", unit="demo") as bar:
+        model_file = call(_model).result()
+        write_robomimic(
+            path,
+            _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
+            env_args=task_env_args(task),
+            model_file=model_file,
+            seed=seed,
+            attributes={"source": "scripted", "generator_version": GENERATOR_VERSION},
+        )
+    return path
+
+
+def _successes(
+    call: Callable[[Callable[[str], Episode]], Future[Episode]],
+    ahead: int,
+    style: str,
+    n: int,
+    first: int,
+    report: Callable[[int], Any],
+) -> Iterator[Episode]:
+    """Yield the first ``n`` successes in seed order, the same number from each operator."""
+    operators = len(OPERATORS) if style == "mh" else 1
+    remaining = [n // operators + (i < n % operators) for i in range(operators)]
+    limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
+    upcoming = iter(range(first, first + limit))
+    running: deque[Future[Episode]] = deque()
+    played = 0
+    while any(remaining):
+        while len(running) < ahead:
+            # Seeds of operators who have contributed enough are skipped, which does not change the result.
+            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
+            if following is None:
+                break
+            running.append(call(partial(_play, style=style, seed=following)))
+        if not running:
+            raise RuntimeError(
+                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
+            )
+        episode = running.popleft().result()
+        played += 1
+        if episode.success and remaining[episode.operator]:
+            remaining[episode.operator] -= 1
+            report(1)
+            yield episode
+    logger.info(f"{n} demonstrations from {played} scripted episodes")
+
+
+@cache
+def _loop(task: str) -> ControlLoop:
+    """Return the simulation of a task, one per worker."""
+    return expert_loop(task)
+
+
+def _model(task: str) -> str:
+    """Return the simulator's model as XML."""
+    return str(_loop(task).env.sim.model.get_xml())
+
+
+def _play(task: str, style: str, seed: int) -> Episode:
+    return run_episode(_loop(task), task, style, seed)

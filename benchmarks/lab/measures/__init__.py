@@ -1,0 +1,1 @@
+"""What is measured on policies beside their success, a clock, and intervals."""

@@ -1,0 +1,1 @@
+"""Jobs that train, measure, play and film policies, and agents in their source space."""

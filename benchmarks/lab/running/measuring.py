@@ -1,0 +1,143 @@
+"""The job that measures a policy on its training data, and the observations that it has not seen."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from lab.demonstrations.scripted.generate import generate_demonstrations
+from lab.demonstrations.tasks import place_of, read_like
+from lab.measures.memory_gain import memory_gain
+from lab.measures.source_errors import mean_error, source_coverage
+from lab.measures.straightness import bounds
+from lab.options.options import MeasuredOptions
+from lab.running.policies import Policy
+from warmprior.diagnostics import (
+    SharedObservations,
+    curvature,
+    encoded_windows,
+    source_leak,
+)
+from warmprior.diagnostics.flow import allowed_nfes
+from warmprior.keys import EPISODE, OBSERVATION, STATE
+
+MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
+HELD_OUT_SEED = 50  # seed of generated held-out demonstrations; training data have seed 0
+
+TRAINED_ON = "the TRAINING demonstrations (not held out)"
+
+
+def measure(
+    trained: Policy, nfe: Sequence[int], temperature: float = 1.0
+) -> dict[int, dict[str, float | None]]:
+    """Return the measures of a policy on its training data, by NFE; all policies get the same draws."""
+    policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
+    policy = policy.replace(temperature=temperature)
+    nfes, observation_steps = method.nfes(nfe), trained.network.observation_steps
+    shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
+    drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+    shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
+    windows = shared.windows(policy.prior, see_history=policy.sees_history)
+    encoded = encoded_windows(policy, windows)
+    leaks: Mapping[int, Any] = {}
+    if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
+        leaks = source_leak(policy, encoded, nfes=nfes, episodes=shared.episodes)
+    generator = torch.Generator().manual_seed(0)
+    deployed = shared.deployed(policy, generator=generator)
+    allowed = allowed_nfes(policy, nfes)
+    means = {nfe: mean_error(policy, deployed, nfe=nfe) for nfe in allowed}
+    gains = memory_gain(policy, windows if policy.sees_history else encoded, nfes=nfes)
+    # The curvature of the flow between source and targets, over the executed positions.
+    kappa, relative = math.nan, math.nan
+    if policy.sampling.max_nfe is None:
+        with warnings.catch_warnings():  # NaN marks a field that does not move
+            warnings.simplefilter("ignore")
+            values = curvature(policy, deployed, generator=generator)
+        kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
+    flow = {
+        "kappa": kappa,
+        "relative_curvature": relative,
+        "bound": float(bounds(policy.prior, deployed, method.parts.coupling is not None)[1]),
+        "coverage": source_coverage(policy, deployed),
+    }
+    return {
+        nfe: {
+            "mean_error": means[nfe].target,
+            "mean_revision_data": means[nfe].revision,
+            "source_leak": leaks[nfe].leak if nfe in leaks else None,
+            "inner_step_ratio": leaks[nfe].inner_step_ratio if nfe in leaks else None,
+            "memory_gain": gains[nfe],
+            **flow,
+        }
+        for nfe in allowed
+    }
+
+
+def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
+    """Return held-out observations of a policy's task, and a description of them.
+
+    For the toy and for tasks outside robosuite they are the training data.
+
+    Raises:
+        ValueError: if there are no held-out data, or some of them were trained on (masks may overlap, and
+            files may have demonstrations in common).
+    """
+    place: Path | str
+    task, chunk_length = policy.task(), policy.method.chunk_length
+    facts, device, count = task.facts, options.run.device, options.observations
+    validation, mask = options.validation, None
+    generator = torch.Generator().manual_seed(0)
+    shape: dict[str, Any] = {"observation_steps": policy.network.observation_steps}
+    if task.normalizer is None or "sha256" not in facts:
+        if validation is not None:
+            raise ValueError(f"--validation is for robosuite's tasks: leave it out with {task.name}")
+        shared = SharedObservations(task.data.to(device), chunk_length, **shape)
+        if len(shared) > count:
+            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
+        return shared, TRAINED_ON
+    if validation is not None:
+        place, words = validation, ""
+    elif policy.data.mask == "train":
+        place, words, mask = place_of(policy.data, task.name, task.style)[0], "", "valid"
+    elif facts.get("source") != "scripted":
+        raise ValueError(
+            f"the policies are trained on all of {facts['file']}: train them with --mask train, to measure "
+            "on the file's mask valid, or add --validation FILE with other demonstrations (or with the same "
+            "file, to measure on the training data)"
+        )
+    else:
+        # Enough demonstrations for the observations, judged by the length of the training demonstrations.
+        usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
+        episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
+        place = generate_demonstrations(task.name, task.style, episodes, HELD_OUT_SEED)
+        words = f"{episodes} newly generated demonstrations"
+    data, called = read_like(place, task.name, facts, mask)
+    # A copy, because the data are normalised on the CPU and the policy may be on another device.
+    data = copy.deepcopy(task.normalizer).to("cpu").normalize(data)
+    trained, measured = (set(_episodes(part)) for part in (task.data, data))
+    if common := measured & trained:
+        if validation is None or common != measured:
+            raise ValueError(
+                f"{called} has {len(common)} of {len(measured)} demonstrations in common with the training "
+                f"data, {facts['file']}: choose masks, or a --validation, without them"
+            )
+        words = TRAINED_ON
+    data = data.to(device)
+    return SharedObservations(data, chunk_length, **shape, count=count, generator=generator), words or called
+
+
+def _episodes(data: TensorDictBase) -> list[str]:
+    """Return a digest of the observations of every demonstration."""
+    observation = data[OBSERVATION]
+    vector = observation[STATE] if isinstance(observation, TensorDictBase) else observation
+    lengths = [n for n in data[EPISODE].flatten().bincount().tolist() if n]
+    parts = vector.cpu().contiguous().split(lengths)
+    return [hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in parts]
