@@ -256,7 +256,7 @@ def improve(
     result = improve_policy(actor, place, num_envs=num_envs, config=config, episodes=episodes)
     save_policy(result.policy, place / "policy")
     words = "no agent was better, so the policy is as it was"
-    if result.policy.start is not None:
+    if result.policy.start is not actor.start:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
     print(f"{words}\nto play it: python -m warmprior evaluate {place / 'policy'}")
 

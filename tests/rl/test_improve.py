@@ -1,6 +1,7 @@
 """A saved policy is improved, the better policy is kept, and nothing is lost at an interruption."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
@@ -8,13 +9,18 @@ from tests.errors import raises
 from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
 from tests.states import same
 from warmprior import GaussianPrior, PastPrior, policy_transforms
+from warmprior.envs.description import registered_description
 from warmprior.evaluation import evaluate, parallel_env
-from warmprior.rl import improve_policy, improved_policy
+from warmprior.rl import improve, improve_policy, improved_policy
 from warmprior.saving import load_policy, save_policy
 
 
 class ReachEnv(SolvableEnv):
     """A success where the actions of an episode sum to more than 1; a policy that stays at 0 has none."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.episode = -1  # no episode depends on those before
+        return super()._reset(tensordict, **kwargs)
 
     def _seen(self, out):
         reached = out["observation"][..., 2:3] > 0.5
@@ -69,11 +75,36 @@ def test_a_policy_is_improved_compared_and_saved(tmp_path):
     save_policy(result.policy, tmp_path / "policy")
     env = parallel_env(make_env, transforms, 2)
     for policy, solved in ((actor, result.before), (load_policy(tmp_path / "policy"), result.after)):
-        played = evaluate(policy, env, episodes=4, first_seed=10_005_000, nfe=2)
+        played = evaluate(policy, env, episodes=4, first_seed=10_000_000, nfe=2)
         assert sum(episode.success for episode in played) == solved
     env.close()
     again = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
     assert again.curve == result.curve and (again.before, again.after) == (result.before, result.after)
+
+
+@pytest.mark.parametrize("confirmed", [(1, 2), (2, 2), (2, 1)])
+def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monkeypatch, confirmed):
+    """The evaluations choose the luckiest of several; the frozen policy stays unless others confirm it."""
+    actor = make_actor()
+    policies, seeds = [], []
+
+    def counted(policy, env, *, episodes, first_seed, **options):
+        seeds.append(first_seed)
+        policies.append(policy)
+        solved = confirmed[len(seeds) - 1] if len(seeds) < 3 else 3
+        return [SimpleNamespace(success=k < solved) for k in range(episodes)]
+
+    monkeypatch.setattr(improve, "evaluate", counted)
+    lucky = improved_policy(actor, make_training(tmp_path / "other", actor=actor).agent.network, nfe=2)
+    monkeypatch.setattr(improve.PriorSpaceTraining, "run", lambda self: [])
+    monkeypatch.setattr(improve.PriorSpaceTraining, "policy", lambda self: lucky)
+    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
+    options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
+    result = improve_policy(actor, tmp_path, config=make_config(environment_steps=60), episodes=4, **options)
+    kept = confirmed[1] > confirmed[0]
+    assert (result.policy is lucky) is kept and (result.before, result.after) == (3, 3)
+    assert len(policies) == 3 + kept and policies[1] is lucky
+    assert len({*seeds[:2]}) == 1 and seeds[2] == 10_000_000 and seeds[0] > 10_000_000 + 4
 
 
 def test_a_policy_without_an_environment_is_refused(tmp_path):
@@ -81,4 +112,8 @@ def test_a_policy_without_an_environment_is_refused(tmp_path):
         improve_policy(make_actor(), tmp_path)
     with raises(ValueError, "make_transforms"):
         improve_policy(make_actor(), tmp_path, make_env=make_env)
+    registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": "is_success"}
+    description = registered_description({**registered, "observation_keys": ["observation"]})
+    with raises(ValueError, "Gymnasium", "make_env"):
+        improve_policy(make_actor().replace(environment=description), tmp_path)
     assert not list(tmp_path.iterdir())

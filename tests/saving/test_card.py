@@ -72,6 +72,7 @@ def test_what_is_not_known_is_said():
     card = model_card(ACTOR, repository="me/it")
     assert "license" not in card and "Not measured" in card and "| environment | not known |" in card
     assert 'load_policy("me/it")' in card and "environment_of" not in card
+    exec(card.split("```python\n")[1].splitlines()[0])  # the import
     assert warmprior.__version__ in card
 
 

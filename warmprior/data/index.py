@@ -54,7 +54,7 @@ class DatasetIndex:
         available_keys: all observations.
         env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
-        whole: False if only the first of the demonstrations were asked for.
+        whole: False if only some of the demonstrations were asked for.
         rate: control steps per second, if they are known.
     """
 

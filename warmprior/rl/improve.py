@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose
 
@@ -33,8 +34,8 @@ SMALL = PriorSpaceConfig(
 )
 """A recipe for two cores and simulated manipulation, whose episodes have some fifty decisions."""
 
-REPORTED = 5_000
-"""The distance of the reported episodes' seeds from those by which the policy is chosen."""
+APART = 5_000
+"""The distance between the seeds of episodes that are reported, that choose an agent, and that confirm it."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def improve_policy(
 
     The policy stays frozen, and an agent learns where its flow starts (:class:`PriorSpaceTraining`). The
     environment's reward is that of the task: 1 where a control step solves it, else 0. The best agent of the
-    evaluations is kept, or the frozen policy if none was better; both then play other episodes.
+    evaluations is kept if it also solves more of other episodes, as the best of several is better by chance
+    alone. The policies before and after then play a third set: that of ``python -m warmprior evaluate``.
 
     Args:
         policy: the policy, such as one of :func:`~warmprior.saving.load_policy`. It must solve some
@@ -96,8 +98,8 @@ def improve_policy(
         description: label of the progress bars; none if ``None``.
 
     Raises:
-        ValueError: if the policy keeps no description of an environment and ``make_env`` is missing, or the
-            recipe does not fit the policy.
+        ValueError: if the policy keeps no description of a robosuite environment and ``make_env`` is missing,
+            the policy sees images, or the recipe does not fit the policy.
         FloatingPointError: if the training diverges; the last save stays.
 
     Examples:
@@ -120,10 +122,17 @@ def improve_policy(
         (0, 0)
     """
     # Only here, because the package is imported without its environments.
-    from warmprior.envs.description import environment_parts
+    from warmprior.envs.description import environment_parts, is_registered
     from warmprior.envs.tasks import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
+    if getattr(policy.network, "encodes", False):
+        raise ValueError("a policy that sees images cannot be improved: an agent would read features alone")
+    if make_env is None and is_registered(policy.environment):
+        raise ValueError(
+            "the policy's environment is Gymnasium's, whose episodes have no numbers and whose reward may be "
+            "another than success: pass make_env, which builds one that has both"
+        )
     if make_env is None:
         make_env, make_transforms = environment_parts(policy)
     elif make_transforms is None:
@@ -131,30 +140,41 @@ def improve_policy(
     builders = make_env, make_transforms
     config = replace(SMALL, nfe=policy.sampling.evaluations()) if config is None else config
 
+    if max(episodes, config.evaluation_episodes) > APART:
+        raise ValueError(f"more than {APART} episodes would choose and report by the same ones")
+
     def environment(seed: int) -> EnvBase:
         # Outside of the workers one anchor draws for all environments.
         env = TransformedEnv(parallel_env(*builders, num_envs), PriorAnchor(policy))
         env.set_seed(seed, static_seed=True)
         return env
 
-    with torch_threads(1):  # TorchRL resets the number of threads when workers end
+    # TorchRL resets the number of threads when workers end.
+    with torch_threads(1), torch.random.fork_rng(devices=[]):
         training = PriorSpaceTraining(
-            policy, environment, config, directory, evaluation_seed=EVALUATION_SEED, description=description
+            policy,
+            environment,
+            config,
+            directory,
+            evaluation_seed=EVALUATION_SEED + APART,
+            description=description,
         )
         curve = training.run()
-        improved = training.policy()
+        frozen, improved = policy.replace(nfe=config.nfe), training.policy()
         env = parallel_env(*builders, num_envs)
-        solved: list[int] = []
-        for name, played in (("before", policy.replace(nfe=config.nfe)), ("after", improved)):
-            outcomes = evaluate(
-                played,
-                env,
-                episodes=episodes,
-                first_seed=EVALUATION_SEED + REPORTED,
-                policy_seed=config.seed,
-                description=None if description is None else name,
-            )
-            solved.append(sum(outcome.success for outcome in outcomes))
+
+        def solved(played: WarmPriorActor, first_seed: int, name: str) -> int:
+            label = None if description is None else name
+            options: dict[str, Any] = {"policy_seed": config.seed, "description": label}
+            outcomes = evaluate(played, env, episodes=episodes, first_seed=first_seed, **options)
+            return sum(outcome.success for outcome in outcomes)
+
+        if improved.start is not frozen.start:
+            confirming = EVALUATION_SEED + 2 * APART
+            counts = [solved(played, confirming, "confirm") for played in (frozen, improved)]
+            improved = improved if counts[1] > counts[0] else frozen
+        before = after = solved(frozen, EVALUATION_SEED, "before")
+        if improved is not frozen:
+            after = solved(improved, EVALUATION_SEED, "after")
         env.close(raise_if_closed=False)
-    before, after = solved
     return Improvement(improved, before, after, episodes, curve)

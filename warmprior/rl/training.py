@@ -162,6 +162,9 @@ class PriorSpaceTraining:
             "config": asdict(config),
             "prior": actor.prior.config(),
             "sampling": asdict(actor.sampling),
+            "start": None if actor.start is None else actor.start.config(),
+            "environment": actor.environment,
+            "evaluation_seed": evaluation_seed,
             "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
             "transitions": self._keys,
         }

@@ -92,13 +92,14 @@ def _facts(actor: WarmPriorActor) -> dict[str, str]:
 
 def _usage(actor: WarmPriorActor, repository: str, playable: bool) -> str:
     path = getattr(actor.network, "interpolant", None)
+    starts = [] if actor.start is None else actor.start.modules()
     own = dict.fromkeys(
         f"{type(part).__name__} of {type(part).__module__}"
-        for part in (actor.prior, actor.start, path, *actor.network.modules())
+        for part in (actor.prior, *starts, path, *actor.network.modules())
         if isinstance(part, Registered) and not type(part).__module__.startswith("warmprior.")
     )
     words = f"It needs classes of its author: import {' and '.join(own)} first.\n\n" if own else ""
-    lines = ["from warmprior.training import load_policy", "", f'actor = load_policy("{repository}")']
+    lines = ["from warmprior.saving import load_policy", "", f'actor = load_policy("{repository}")']
     if playable:
         lines.insert(1, "from warmprior.envs import environment_of")
         lines.append("environment_of(actor).rollout(100, actor)")

@@ -99,7 +99,7 @@ def _robosuite(
     # Poses in the units of deltas: errors and sigma have the same meaning in both spaces, and the loss does
     # not give positions, whose range is large, little weight compared with the gripper.
     absolute: Any = adapters.get("actions")
-    demos = None if index.whole else demonstrations.demos
+    demos = None if index.whole else list(index.demos)
     sha256 = demonstrations.digest(index)
     # The default is left out.
     space: dict[str, Any] = {} if actions == "delta" else {"actions": actions}

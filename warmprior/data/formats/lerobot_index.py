@@ -294,7 +294,7 @@ def read_lerobot_index(
             raise DatasetError(f"{root}: the mask {mask!r} names no episode: choose another, or none")
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demonstrations.demos, len(rows))
-    count, rows = len(rows), rows[: demonstrations.demos]
+    rows = rows[: demonstrations.demos]
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),
