@@ -357,6 +357,7 @@ def train(
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
     task, left_out = whole.split(tenth if held_out is None else held_out)
+    print(task.recording.text("--{}"), flush=True)
     name = f"{task.name}-{task.style}-{','.join([source.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,

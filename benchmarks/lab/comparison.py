@@ -19,6 +19,7 @@ from lab.methods import Method
 from lab.options import Evaluation, Options
 from lab.policies import Cell, Policy, facts_of, play, row, train, write_rows
 from lab.rows import PLAYED, read_rows
+from lab.tasks import title_of
 from warmprior.evaluation import Episode
 from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic
@@ -125,6 +126,8 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
         write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
+        for task in tasks if not all(policy.is_trained for policy in policies) else ():
+            print(f"{title_of(task)}:\n{task.recording.text('--{}')}", flush=True)
 
     failures = {}
     for policy in policies if world_size() > 1 else ():

@@ -51,7 +51,10 @@ class DatasetIndex:
         image_shapes: heights and widths of the images to read, as they are stored.
         image_size: side in pixels to which these are resized; 0 if there are none.
         resize: how they are resized, see :func:`~warmprior.modules.resize.resized`.
+        images: the place's own names of images that have another here.
         available_keys: all observations.
+        taken_by: the option that takes an observation if it is not ``"observations"``: ``"images"``, or
+            ``""`` for one that no option takes.
         env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
         whole: False if only the first of the demonstrations were asked for.
@@ -67,7 +70,9 @@ class DatasetIndex:
     image_shapes: tuple[tuple[int, int], ...] = ()
     image_size: int = 0
     resize: Resize = "squeeze"
+    images: Mapping[str, str] = field(default_factory=dict)
     available_keys: tuple[str, ...]
+    taken_by: Mapping[str, str] = field(default_factory=dict)
     action_dim: int
     env_args: dict[str, Any] = field(default_factory=dict)
     task: TaskSpec | None = None
@@ -81,6 +86,15 @@ class DatasetIndex:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
         check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
+
+    @property
+    def left_out(self) -> dict[str, list[str]]:
+        """The observations that are not read, by the option that would take them."""
+        others: dict[str, list[str]] = {}
+        for key in self.available_keys:
+            if key not in (*self.observation_keys, *self.image_keys):
+                others.setdefault(self.taken_by.get(key, "observations"), []).append(key)
+        return others
 
     @property
     def cameras(self) -> tuple[str, ...]:

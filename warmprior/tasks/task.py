@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
@@ -23,6 +23,7 @@ from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
+from warmprior.modules.recording import Recording
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose
 from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
@@ -31,6 +32,7 @@ from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 if TYPE_CHECKING:  # training on steps in memory needs no reader and no simulator
     from warmprior.data.demonstrations import Demonstrations
+    from warmprior.data.index import DatasetIndex
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,7 @@ class Task:
         make_env: builds the environment in which episodes are played.
         normalizer: converts between raw and normalised units; ``None`` if they are the same.
         facts: facts about the data for results, as JSON.
+        recording: what policies see, what is left out, and what their actions are.
         adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
         rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.PoseTrend`.
@@ -211,6 +214,7 @@ class Task:
                 self.rest = RestingPose(recorded.poses, self.normalizer)
         if joints is not None:
             self.rest = self._joints(index.joint_columns(joints) if isinstance(joints, str) else [*joints])
+        self.recording = self._recording(demonstrations.name, index, joints)
 
     def _joints(self, columns: list[int]) -> RestingJoints:
         """Return the resting action of joint targets, after checking that actions are near the joints."""
@@ -234,6 +238,31 @@ class Task:
                 f"action {worst} (number {columns[worst]} of the observation): use the same order and units"
             )
         return rest
+
+    def _recording(self, name: str, index: DatasetIndex, joints: str | Sequence[int] | None) -> Recording:
+        """Return what policies see of demonstrations, and what is left out."""
+        actions = "as recorded" if self.environment is None else "as recorded for the environment"
+        if isinstance(self.rest, RestingPose):
+            actions = "absolute poses"
+        elif self.rest is not None:
+            targets = joints if isinstance(joints, str) else f"the observation's numbers {list(joints or ())}"
+            actions = f"absolute targets of {targets}"
+        images = {}
+        for key, (height, width) in zip(index.image_keys, index.image_shapes, strict=True):
+            side, way = index.image_size, "padded" if index.resize == "pad" else "squeezed"
+            changed = "" if height == width == side else f" {way} to {side} x {side}"
+            images[key] = f"{height} x {width}{changed}"
+        return Recording(
+            name,
+            self.facts["demonstrations"],
+            self.facts["steps"],
+            f"[{self.data[ACTION].shape[-1]}], {actions}",
+            dict(zip(index.observation_keys, index.observation_dims, strict=True)),
+            images,
+            {key: index.images[key] for key in index.image_keys if key in index.images},
+            index.left_out,
+            index.rate,
+        )
 
     def env(
         self,
@@ -322,7 +351,8 @@ class Task:
         part = copy.copy(self)
         part.__dict__.pop("identity", None)
         part.data = self.data[kept]
-        part.facts = self.facts | {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
+        sizes: dict[str, Any] = {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
+        part.facts, part.recording = self.facts | sizes, replace(self.recording, **sizes)
         part.digest = None if self.digest is None else digest_of(self.digest, held_out)
         return part, self.data[left_out]
 

@@ -33,6 +33,7 @@ DESCRIPTION = "meta/warmprior.json"
 
 ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
 REWARD, SUCCESS = "next.reward", "next.success"
+_COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 _ARM_ACTIONS = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 
 LEROBOT_VERSION = "v3.0"
@@ -75,14 +76,12 @@ class LeRobotIndex(DatasetIndex):
         metadata: LeRobot's own ``LeRobotDatasetMetadata``.
         episodes: the rows of ``meta/episodes`` of the selected episodes.
         columns: for each observation, the feature that holds it and its columns there.
-        images: the feature of each image to read.
         described: the content of ``meta/warmprior.json``; empty for datasets that were not converted.
     """
 
     metadata: Any
     episodes: tuple[Mapping[str, Any], ...]
     columns: Mapping[str, tuple[str, slice]]
-    images: Mapping[str, str]
     described: Mapping[str, Any]
 
     @property
@@ -295,6 +294,10 @@ def read_lerobot_index(
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demonstrations.demos, len(rows))
     count, rows = len(rows), rows[: demonstrations.demos]
+    others = [name for name in metadata.features if name not in widths and name not in cameras.values()]
+    # A feature is no observation of its own if it is a step's number, or a converted one's parts have names.
+    parts_of = {feature for feature, _ in named.values()}
+    hidden = {name for name in metadata.features if name in parts_of | _COUNTERS or name.startswith("next.")}
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),
@@ -304,7 +307,8 @@ def read_lerobot_index(
         **demonstrations.pictured(
             images, {key: _image_shape(root, metadata.features, cameras, key) for key in images}
         ),
-        available_keys=(*columns, *cameras),
+        available_keys=tuple(name for name in (*columns, *cameras, *others) if name not in hidden),
+        taken_by=dict.fromkeys(cameras, "images") | dict.fromkeys(others, ""),
         action_dim=widths["action"],
         env_args=recorded,
         task=task,

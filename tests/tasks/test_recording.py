@@ -1,0 +1,98 @@
+"""What is used of a place and what is not is said before a training, and kept."""
+
+import numpy as np
+import pytest
+
+from tests.errors import missing
+from warmprior import PastPrior
+from warmprior.__main__ import main
+from warmprior.data import open_demonstrations
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+
+h5py = pytest.importorskip("h5py")
+
+LENGTHS = (12, 15, 9)
+
+
+def robot_file(path, **more):
+    """A robot's own file: vectors, a camera, a text, and what the arguments add, by name."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for i, length in enumerate(LENGTHS):
+            demo = {
+                "actions": rng.normal(size=(length, 3)),
+                "obs/robot0_eef_pos": rng.normal(size=(length, 3)),
+                "obs/robot0_gripper_qpos": rng.normal(size=(length, 2)),
+                "obs/robot0_ft": rng.normal(size=(length, 6)),
+                "obs/force": rng.normal(size=length),
+                "obs/wrist": np.zeros((length, 6, 8, 3), np.uint8),
+                "obs/depth": np.zeros((length, 6, 8), np.float32),
+            }
+            demo |= {f"obs/{name}": make(demo["actions"]) for name, make in more.items()}
+            for name, value in demo.items():
+                file[f"data/demo_{i}/{name}"] = value
+    return path
+
+
+def lines_of(text):
+    return dict(line.split(maxsplit=1) for line in text.replace("left out", "left_out").splitlines())
+
+
+def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --held-out 1"
+    assert main(words.split()) == 0
+    said = lines_of("\n".join(capsys.readouterr().out.splitlines()[:5]))
+    assert said["observations"] == "robot0_eef_pos [3], robot0_gripper_qpos [2], force [1]"
+    assert said["images"] == "none"
+    assert not missing(said["left_out"], "robot0_ft (--observations)", "wrist (--images)", "depth (no option")
+    assert not missing(said["actions"], "[3]", "recorded")
+    assert not missing(said["trained"], "arm.hdf5", "2 demonstrations", "27 steps")
+
+
+def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
+    task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
+    recording = task.recording
+    assert list(recording.observations.items()) == [("robot0_ft", 6), ("force", 1)]
+    assert recording.left_out["observations"] == ["robot0_eef_pos", "robot0_gripper_qpos"]
+    assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "4 x 4")
+    assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
+
+
+def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    options = {"network": NetworkOptions(hidden_dim=8), "training": TrainingConfig(iterations=1)}
+    train_policy(path, PastPrior(4), description=None, **options)
+    assert not capsys.readouterr().err
+    train_policy(path, PastPrior(4), **options)
+    assert not missing(capsys.readouterr().err, "robot0_ft (observations=)", "wrist (images=)")
+
+
+def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import numbers, write_lerobot
+
+    features = {"observation.state": numbers(6), "observation.effort": numbers(6), "action": numbers(6)}
+    write_lerobot(tmp_path / "arm", (8, 8), features, images=[("front", "image")], fps=30)
+    recording = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}")).recording
+    assert recording.observations == {"observation.state": 6} and recording.rate == 30
+    assert recording.left_out == {"observations": ["observation.effort"], "images": ["front_image"]}
+    seeing = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}"), images=["observation.images.front"])
+    assert seeing.recording.names == {"front_image": "observation.images.front"}
+    assert "images" not in seeing.recording.left_out
+
+
+def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):
+    pytest.importorskip("lerobot.datasets")
+    pytest.importorskip("robosuite")
+    from tests.data.synthetic import write_robomimic_file
+    from warmprior.data import convert_robomimic
+
+    write_robomimic_file(tmp_path / "lift.hdf5", task="lift")
+    folder = convert_robomimic(tmp_path / "lift.hdf5", tmp_path / "lift")
+    file, dataset = (Task(open_demonstrations(p)) for p in (tmp_path / "lift.hdf5", f"lerobot:{folder}"))
+    assert dataset.recording.observations == file.recording.observations
+    assert dataset.recording.left_out == {} and dataset.recording.rate == 20
+    assert file.recording.left_out == {"images": ["agentview_image"], "observations": ["robot0_eef_vel_lin"]}
