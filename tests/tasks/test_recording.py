@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.errors import missing
+from tests.errors import missing, raises
 from warmprior import PastPrior
 from warmprior.__main__ import main
-from warmprior.data import open_demonstrations
+from warmprior.data import DatasetError, open_demonstrations
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
@@ -96,3 +96,37 @@ def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):
     assert dataset.recording.observations == file.recording.observations
     assert dataset.recording.left_out == {} and dataset.recording.rate == 20
     assert file.recording.left_out == {"images": ["agentview_image"], "observations": ["robot0_eef_vel_lin"]}
+
+
+def moved(steps):
+    """The actions of some steps later (or before, if negative), where the episode has them."""
+    return lambda actions: actions[np.clip(np.arange(len(actions)) + steps, 0, len(actions) - 1)]
+
+
+SEEN = {
+    "actions": moved(0),
+    "next_actions": moved(1),
+    "targets": lambda actions: np.concatenate([actions, np.ones((len(actions), 2))], 1),
+    "command": lambda actions: actions[:, 1],
+}
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp_path, name):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", **{name: SEEN[name]}))
+    with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
+        Task(demonstrations)
+    named = ["robot0_eef_pos", name]
+    assert list(Task(demonstrations, observations=named).recording.observations) == named
+
+
+@pytest.mark.parametrize("make", [moved(-1), lambda actions: np.ones((len(actions), 3))])
+def test_a_state_that_reaches_the_last_target_is_no_target(tmp_path, make):
+    """Nor is a number that never changes, even if an action is the same."""
+    path = robot_file(tmp_path / "arm.hdf5", joints=make)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            actions = demo["actions"][()]
+            actions[:, 2] = 1
+            demo["actions"][...] = actions
+    assert Task(open_demonstrations(path)).recording.observations["joints"] == 3

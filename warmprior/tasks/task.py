@@ -118,7 +118,8 @@ class Task:
     Raises:
         FileNotFoundError: if there is no such file or dataset.
         OSError: if a download fails.
-        DatasetError: if the data are invalid, or their images differ from the simulator's.
+        DatasetError: if the data are invalid, their images differ from the simulator's, or an observation
+            that was not named holds the action of the same or a later step.
         ValueError: if name or style cannot be part of a file name, the place holds another task, its actions
             are not near the joints, or an option is unknown or for another environment.
 
@@ -184,6 +185,8 @@ class Task:
             actions=actions,
             storage="memmap" if index.image_keys else "memory",
         )
+        if observations is None:
+            demonstrations.check_targets(index, steps)
         vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
         self.resize = index.resize
         self.name = demonstrations.title if recorded is None else recorded.name
