@@ -267,7 +267,8 @@ class Data(Resizing):
 
     Attributes:
         observations: observations of the policy, in this order; by default the task's
-        joints: observation of the joint positions that absolute actions target, such as observation.state
+        joints: observation of the joint positions that absolute actions target; by default observation.state
+            of a LeRobotDataset with the names of the actions, if the numbers are near; "" for none
         images: images of the policy, in addition to the robot's state, such as agentview_image
         fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target

@@ -7,6 +7,7 @@ from tests.errors import missing, raises
 from warmprior import PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
+from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
@@ -130,3 +131,45 @@ def test_a_state_that_reaches_the_last_target_is_no_target(tmp_path, make):
             actions[:, 2] = 1
             demo["actions"][...] = actions
     assert Task(open_demonstrations(path)).recording.observations["joints"] == 3
+
+
+JOINTS = [f"joint_{i}.pos" for i in range(6)]
+
+
+def arm(root, names=JOINTS, near=0.05):
+    """A dataset of an arm whose actions are targets near its joints, under the same names."""
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
+
+    features = {"observation.state": numbers(6, JOINTS), "action": numbers(6, names)}
+    values = write_lerobot(root, (30, 30), features, fps=30)
+    targets = 40 * (values["observation.state"] + near * values["action"])
+    edit_table(root / "data/chunk-000/file-000.parquet", action=lambda _: list(targets.astype(np.float32)))
+    scaled = 40 * values["observation.state"]
+    edit_table(
+        root / "data/chunk-000/file-000.parquet",
+        observation__state=lambda _: list(scaled.astype(np.float32)),
+    )
+    return f"lerobot:{root}"
+
+
+def test_absolute_joint_targets_are_recognised_said_and_saved(tmp_path, capsys):
+    place = arm(tmp_path / "arm")
+    words = ["train", place, "--iterations", "1", "--hidden-dim", "8", "--out", str(tmp_path)]
+    assert main(words) == 0
+    *said, folder = capsys.readouterr().out.splitlines()
+    assert not missing(lines_of("\n".join(said[:5]))["actions"], "[6]", "observation.state")
+    assert load_policy(folder).network.trend.rest.columns.tolist() == list(range(6))
+    by_hand = Task(open_demonstrations(place), joints="observation.state")
+    assert Task(open_demonstrations(place)).identity == by_hand.identity
+    assert Task(open_demonstrations(place), joints="").rest is None
+
+
+@pytest.mark.parametrize(("names", "near"), [([f"target_{i}" for i in range(6)], 0.05), (JOINTS, 3.0)])
+def test_other_actions_are_as_recorded(tmp_path, names, near):
+    demonstrations = open_demonstrations(arm(tmp_path / "arm", names, near))
+    task = Task(demonstrations)
+    assert task.rest is None and not missing(task.recording.text(), "joints=")
+    if near > 1:
+        with raises(ValueError, "observation", "units"):
+            Task(demonstrations, joints="observation.state")

@@ -59,6 +59,7 @@ class DatasetIndex:
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
         whole: False if only the first of the demonstrations were asked for.
         rate: control steps per second, if they are known.
+        joints: the observation whose numbers the actions may set, by their names; ``""`` if there is none.
     """
 
     path: Path
@@ -78,6 +79,7 @@ class DatasetIndex:
     task: TaskSpec | None = None
     whole: bool = True
     rate: float | None = None
+    joints: str = ""
 
     def __post_init__(self) -> None:
         if not self.demos:

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 
 from warmprior.checks import check_positive, check_whole_numbers, given
 
+AS_RECORDED = "as recorded"
+"""The end of the words for actions whose meaning is unknown."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -32,7 +35,7 @@ class Recording:
         observations  state [6]
         images        none
         left out      front (images=)
-        actions       [6], as recorded
+        actions       [6], as recorded (joints= names what absolute joint targets set)
         trained on    so101: 2 demonstrations, 60 steps
     """
 
@@ -61,12 +64,13 @@ class Recording:
             f"{', '.join(names)} ({option.format(taken_by) if taken_by else 'no option takes it'})"
             for taken_by, names in self.left_out.items()
         ]
+        hint = f" ({option.format('joints')} names what absolute joint targets set)"
         rate = "" if self.rate is None else f", {self.rate:g} steps per second"
         return {
             "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
             "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
             "left out": "; ".join(left_out) or "nothing",
-            "actions": self.actions,
+            "actions": self.actions + (hint if self.actions.endswith(AS_RECORDED) else ""),
             "trained on": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps{rate}",
         }
 

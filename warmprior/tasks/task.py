@@ -23,7 +23,7 @@ from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
-from warmprior.modules.recording import Recording
+from warmprior.modules.recording import AS_RECORDED, Recording
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose
 from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
@@ -94,7 +94,8 @@ class Task:
         joints: for absolute joint targets, the observation whose numbers the actions set, one by one; actions
             beyond its width are not targets. Or for each action the index in the observation of the number
             that it sets, in the same units, -1 for none. A preconditioned network then learns the motion from
-            there (:class:`~warmprior.RestingJoints`).
+            there (:class:`~warmprior.RestingJoints`). By default ``"observation.state"`` if a LeRobotDataset
+            gives it the names of the actions, and the numbers are near; ``""`` for none.
         actions: the policies' actions: as recorded, or the absolute poses that robosuite's deltas target.
         play: how policies are played; by default as the demonstrations were recorded, if that is known.
 
@@ -215,12 +216,15 @@ class Task:
             self.facts |= recorded.facts
             if recorded.poses is not None:
                 self.rest = RestingPose(recorded.poses, self.normalizer)
-        if joints is not None:
-            self.rest = self._joints(index.joint_columns(joints) if isinstance(joints, str) else [*joints])
-        self.recording = self._recording(demonstrations.name, index, joints)
+        recognised = index.joints if self.rest is None and self.normalizer is not None else ""
+        targets = recognised if joints is None else joints
+        if len(targets):
+            columns = index.joint_columns(targets) if isinstance(targets, str) else [*targets]
+            self.rest = self._joints(columns, needed=joints is not None)
+        self.recording = self._recording(demonstrations.name, index, targets)
 
-    def _joints(self, columns: list[int]) -> RestingJoints:
-        """Return the resting action of joint targets, after checking that actions are near the joints."""
+    def _joints(self, columns: list[int], needed: bool) -> RestingJoints | None:
+        """Return the resting action of joint targets, if actions are near the joints; else ``None``."""
         actions, width = self.data[ACTION], self.vector.shape[-1]
         if self.rest is not None or self.normalizer is None:
             raise ValueError(
@@ -235,21 +239,21 @@ class Task:
             )
         rest = RestingJoints(torch.tensor(columns), self.normalizer)
         worst = rest.farthest(self.vector, actions)
-        if worst is not None:
+        if worst is not None and needed:
             raise ValueError(
                 f"actions of {self.name} are not near the observed numbers they should set, least of all "
                 f"action {worst} (number {columns[worst]} of the observation): use the same order and units"
             )
-        return rest
+        return rest if worst is None else None
 
-    def _recording(self, name: str, index: DatasetIndex, joints: str | Sequence[int] | None) -> Recording:
+    def _recording(self, name: str, index: DatasetIndex, targets: str | Sequence[int]) -> Recording:
         """Return what policies see of demonstrations, and what is left out."""
-        actions = "as recorded" if self.environment is None else "as recorded for the environment"
+        actions = AS_RECORDED if self.environment is None else "as the recorded environment takes them"
         if isinstance(self.rest, RestingPose):
             actions = "absolute poses"
         elif self.rest is not None:
-            targets = joints if isinstance(joints, str) else f"the observation's numbers {list(joints or ())}"
-            actions = f"absolute targets of {targets}"
+            named = targets if isinstance(targets, str) else f"the observation's numbers {list(targets)}"
+            actions = f"absolute targets of {named}"
         images = {}
         for key, (height, width) in zip(index.image_keys, index.image_shapes, strict=True):
             side, way = index.image_size, "padded" if index.resize == "pad" else "squeezed"

@@ -23,7 +23,7 @@ from warmprior.data.index import (
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
-from warmprior.lerobot.names import short_names
+from warmprior.lerobot.names import ROBOT_STATE, named_joints, short_names
 
 if TYPE_CHECKING:
     from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 DESCRIPTION = "meta/warmprior.json"
 """The file that :func:`warmprior.data.convert_robomimic` adds to LeRobot's own, and that LeRobot ignores."""
 
-ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
 REWARD, SUCCESS = "next.reward", "next.success"
 _COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 _ARM_ACTIONS = ("x", "y", "z", "rx", "ry", "rz", "gripper")
@@ -318,6 +318,7 @@ def read_lerobot_index(
         episodes=tuple(rows),
         columns=columns,
         images={key: cameras[key] for key in images},
+        joints=named_joints(metadata.features, observations),
         described=described,
     )
     parts = product(index.videos, ("chunk", "file"))
