@@ -24,13 +24,13 @@ from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior
 from warmprior.modules.resize import Resizing
 from warmprior.saving import load_policy, model_card
 from warmprior.saving.policies import (
     check_repository,
-    policy_config,
     policy_file,
     push_policy,
     save_policy,
@@ -57,7 +57,7 @@ def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPr
 
 
 def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = ()) -> None:
-    """Print a summary of a saved policy.
+    """Print what a saved policy needs, does and was trained on.
 
     Args:
         folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
@@ -69,20 +69,24 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     from warmprior.envs.description import environment_name
 
     actor = _policy(folder, revision, modules)
-    config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
-    shapes = observation_shapes(actor)
-    written = policy_file(folder, revision=revision).get("warmprior", "of an unknown version")
+    count, recording = sum(p.numel() for p in actor.parameters()), actor.recording
+    shapes, sampling, guidance = observation_shapes(actor), actor.sampling, actor.ode.guidance
+    networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
+    file = policy_file(folder, revision=revision)
+    noise = "" if sampling.temperature is None else f", temperature {sampling.temperature:g}"
     for name, value in {
-        "prior": actor.prior,
+        "takes": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
+        **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
+        "source": actor.prior,
         "start": actor.start or "the source",
-        "network": f"{config['network']} ({count:,} parameters)",
-        "sampler": config["actor"],
+        "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid{noise}",
+        **given(guidance=guidance),
+        "network": f"{', '.join(networks)} ({count:,} parameters)",
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",
-        "observation": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
-        "written by": f"warmprior {written}, format {config['format']}",
+        "written by": f"warmprior {file['warmprior']}, format {file['format']}",
     }.items():
-        print(f"{name:12} {value}")
+        print(f"{name:13} {value}")
 
 
 def push(

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from tests.errors import missing, raises
 from warmprior import PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
+from warmprior.deploy import AsyncExecutor
 from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -173,3 +175,41 @@ def test_other_actions_are_as_recorded(tmp_path, names, near):
     if near > 1:
         with raises(ValueError, "observation", "units"):
             Task(demonstrations, joints="observation.state")
+
+
+def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_path, capsys):
+    """In the order of the training, and at its rate, which the executor holds it to."""
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import numbers, write_lerobot
+
+    widths = {"observation.effort": 2, "observation.state": 6, "action": 6}
+    features = {name: numbers(width) for name, width in widths.items()}
+    write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
+    words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
+    words += " --observations observation.state observation.effort --images observation.images.front"
+    assert main(words.split()) == 0
+    folder = capsys.readouterr().out.splitlines()[-1]
+    assert main(["info", folder]) == 0
+    said = lines_of(capsys.readouterr().out.replace("written by", "written_by"))
+    assert said["observations"] == "observation.state [6], observation.effort [2]"
+    assert not missing(said["takes"], "state (8,)", "front_image (3, 32, 32)")
+    assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
+    assert not missing(said["trained"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
+
+    policy, rng = load_policy(folder), np.random.default_rng(0)
+    state, effort = rng.normal(size=6), rng.normal(size=2).astype(np.float32)
+    image = rng.integers(0, 256, (48, 64, 3), np.uint8)
+    ours = {"state": np.concatenate([state, effort]), "front_image": image}
+    theirs = {"observation.effort": effort, "observation.state": state, "observation.images.front": image}
+    actions = []
+    for observation in (ours, theirs):
+        torch.manual_seed(0)
+        with AsyncExecutor(policy, latency=0, control_rate=29.97) as executor:
+            actions.append(executor.act(observation))
+            with raises(KeyError, "front_image"):
+                executor.act({name: value for name, value in observation.items() if "front" not in name})
+    assert torch.equal(*actions)
+    with raises(ValueError, "observation.state", 6), AsyncExecutor(policy, latency=0) as executor:
+        executor.act(theirs | {"observation.state": effort})
+    with raises(ValueError, "control_rate=50", 30):
+        AsyncExecutor(policy, control_rate=50)

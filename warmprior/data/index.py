@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice, check_distinct, check_whole_numbers
+from warmprior.checks import check_choice, check_distinct, check_positive, check_whole_numbers, given
 from warmprior.envs.env_args import declared_actions
 from warmprior.envs.tasks import TaskSpec
 from warmprior.modules.resize import Resize
@@ -87,6 +87,7 @@ class DatasetIndex:
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
+        check_positive(**given(**{f"{self.path}: control steps per second": self.rate}))
         check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
 
     @property

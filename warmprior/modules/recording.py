@@ -65,13 +65,14 @@ class Recording:
             for taken_by, names in self.left_out.items()
         ]
         hint = f" ({option.format('joints')} names what absolute joint targets set)"
-        rate = "" if self.rate is None else f", {self.rate:g} steps per second"
+        rate = {} if self.rate is None else {"rate": f"{self.rate:g} control steps per second"}
         return {
             "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
             "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
             "left out": "; ".join(left_out) or "nothing",
             "actions": self.actions + (hint if self.actions.endswith(AS_RECORDED) else ""),
-            "trained on": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps{rate}",
+            **rate,
+            "trained on": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps",
         }
 
     def text(self, option: str = "{}=") -> str:

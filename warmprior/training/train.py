@@ -74,6 +74,7 @@ def new_policy(
         # A copy, because the policy moves to the device and the environments' normaliser stays on the CPU.
         normalizer=copy.deepcopy(task.normalizer),
         environment=task.environment,
+        recording=task.recording,
     )
 
 
