@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -262,7 +263,12 @@ def improve(
     words = "no agent was better, so the policy is as it was"
     if result.policy.start is not None:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
-    print(f"{words}\nto play it: python -m warmprior evaluate {place / 'policy'}")
+    print(f"{words}\nto play it: {command_of('evaluate', place / 'policy')}")
+
+
+def command_of(command: str, folder: Path) -> str:
+    """Return the line of a shell that runs a command on a policy."""
+    return f"python -m warmprior {command} {shlex.quote(str(folder))}"
 
 
 @dataclass(frozen=True)
@@ -387,7 +393,9 @@ def train(
         for n, error in errors_of(actor, left_out, (*nfes, sampling.evaluations())).items():
             print(f"  NFE {n}: {error:.4f}")
     if playable:
-        print(f"to play it: python -m warmprior evaluate {saved} --nfe {' '.join(map(str, nfes[::-1]))}")
+        print(f"to play it: {command_of('evaluate', saved)} --nfe {' '.join(map(str, nfes[::-1]))}")
+    else:
+        print(f"what a robot has to give it: {command_of('info', saved)}; its loop: docs/your_robot.md")
     print(saved)
 
 

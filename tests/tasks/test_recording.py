@@ -1,5 +1,7 @@
 """What is used of a place and what is not is said before a training, and kept."""
 
+import shlex
+
 import numpy as np
 import pytest
 import torch
@@ -213,3 +215,13 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
         executor.act(theirs | {"observation.state": effort})
     with raises(ValueError, "control_rate=50", 30):
         AsyncExecutor(policy, control_rate=50)
+
+
+def test_the_next_command_of_a_training_without_an_environment_runs_as_it_is_printed(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    out = tmp_path / "my arm's runs"
+    assert main(["train", str(path), "--iterations", "1", "--hidden-dim", "8", "--out", str(out)]) == 0
+    *_, line, folder = capsys.readouterr().out.splitlines()
+    words = shlex.split(line[line.index("python -m") : line.index(";")])
+    assert words == ["python", "-m", "warmprior", "info", folder]
+    assert main(words[3:]) == 0
