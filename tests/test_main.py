@@ -1,3 +1,4 @@
+import shlex
 import shutil
 import sys
 
@@ -153,12 +154,14 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
 
 
 def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
-    path, out = tmp_path / "lift.hdf5", tmp_path / "out"
+    path, out = tmp_path / "lift.hdf5", tmp_path / "my runs"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     argv = ["train", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
     small = [*argv, "--iterations", "2", "--prior", "past,correlation=0.5,sigma=0.3"]
     assert main(small) == 0
-    folder = capsys.readouterr().out.splitlines()[-1]
+    *_, said, folder = capsys.readouterr().out.splitlines()
+    words = shlex.split(said[said.index("python -m") :])
+    assert words[:5] == ["python", "-m", "warmprior", "evaluate", folder]
     assert folder == str(out / "lift-ph-past,correlation=0.5,sigma=0.3-seed3" / "policy_000002")
     assert main(["info", folder]) == 0
     assert "PastPrior(chunk_length=8, sigma=0.3, correlation=0.5)" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,13 +25,13 @@ from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import read_command_line, run_script
 from warmprior.keys import FRAME
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior
 from warmprior.modules.resize import Resizing
 from warmprior.saving import load_policy, model_card
 from warmprior.saving.policies import (
     check_repository,
-    policy_config,
     policy_file,
     push_policy,
     save_policy,
@@ -57,7 +58,7 @@ def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPr
 
 
 def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = ()) -> None:
-    """Print a summary of a saved policy.
+    """Print what a saved policy needs, does and was trained on.
 
     Args:
         folder: folder of the policy, such as .../policy_010000, or user/name of a repository at the
@@ -69,20 +70,24 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     from warmprior.envs.description import environment_name
 
     actor = _policy(folder, revision, modules)
-    config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
-    shapes = observation_shapes(actor)
-    written = policy_file(folder, revision=revision).get("warmprior", "of an unknown version")
+    count, recording = sum(p.numel() for p in actor.parameters()), actor.recording
+    shapes, sampling, guidance = observation_shapes(actor), actor.sampling, actor.ode.guidance
+    networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
+    file = policy_file(folder, revision=revision)
+    noise = "" if sampling.temperature is None else f", temperature {sampling.temperature:g}"
     for name, value in {
-        "prior": actor.prior,
+        "takes": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
+        **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
+        "source": actor.prior,
         "start": actor.start or "the source",
-        "network": f"{config['network']} ({count:,} parameters)",
-        "sampler": config["actor"],
+        "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid{noise}",
+        **given(guidance=guidance),
+        "network": f"{', '.join(networks)} ({count:,} parameters)",
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",
-        "observation": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
-        "written by": f"warmprior {written}, format {config['format']}",
+        "written by": f"warmprior {file['warmprior']}, format {file['format']}",
     }.items():
-        print(f"{name:12} {value}")
+        print(f"{name:13} {value}")
 
 
 def push(
@@ -258,7 +263,12 @@ def improve(
     words = "no agent was better, so the policy is as it was"
     if result.policy.start is not actor.start:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
-    print(f"{words}\nto play it: python -m warmprior evaluate {place / 'policy'}")
+    print(f"{words}\nto play it: {command_of('evaluate', place / 'policy')}")
+
+
+def command_of(command: str, folder: Path) -> str:
+    """Return the line of a shell that runs a command on a policy."""
+    return f"python -m warmprior {command} {shlex.quote(str(folder))}"
 
 
 @dataclass(frozen=True)
@@ -267,7 +277,8 @@ class Data(Resizing):
 
     Attributes:
         observations: observations of the policy, in this order; by default the task's
-        joints: observation of the joint positions that absolute actions target, such as observation.state
+        joints: observation of the joint positions that absolute actions target; by default observation.state
+            of a LeRobotDataset with the names of the actions, if the numbers are near; "" for none
         images: images of the policy, in addition to the robot's state, such as agentview_image
         fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
@@ -357,6 +368,7 @@ def train(
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
     task, left_out = whole.split(tenth if held_out is None else held_out)
+    print(task.recording.text("--{}"), flush=True)
     name = f"{task.name}-{task.style}-{','.join([source.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,
@@ -381,7 +393,9 @@ def train(
         for n, error in errors_of(actor, left_out, (*nfes, sampling.evaluations())).items():
             print(f"  NFE {n}: {error:.4f}")
     if playable:
-        print(f"to play it: python -m warmprior evaluate {saved} --nfe {' '.join(map(str, nfes[::-1]))}")
+        print(f"to play it: {command_of('evaluate', saved)} --nfe {' '.join(map(str, nfes[::-1]))}")
+    else:
+        print(f"what a robot has to give it: {command_of('info', saved)}; its loop: docs/your_robot.md")
     print(saved)
 
 

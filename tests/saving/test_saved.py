@@ -24,6 +24,7 @@ from warmprior import (
     WarmPriorActor,
     keys,
 )
+from warmprior.modules.recording import Recording
 from warmprior.saving.checkpoint import load_state, save_state
 from warmprior.saving.policies import FORMAT, load_policy, policy_config, save_policy
 
@@ -82,8 +83,9 @@ TRANSFORMER = {"embedding_dim": 12, "num_layers": 2, "num_heads": 2}
         lambda: policy(start=Halfway(0.25)),
         lambda: policy(guidance=RealTimeChunking(2, schedule="linear", jacobian=False, sigma=1.0)),
         lambda: policy(environment={"task": "square"}),
+        lambda: policy(recording=Recording("arm", 2, 9, "[2]", {"joints": D_O}, {}, {}, {"": ["text"]}, 30)),
     ],
-    ids=range(9),
+    ids=range(10),
 )
 def test_round_trip_is_bit_identical(tmp_path, make):
     actor = make()
@@ -269,3 +271,14 @@ def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
         writer.kill()
         writer.join()
     assert seen == {0.25, 0.5}
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [("rate", "fast"), ("rate", -1), ("observations", {"joints": 0.5}), ("names", {"a": 3}), ("left_out", 7)],
+)
+def test_what_it_was_trained_on_has_the_form_that_is_printed(tmp_path, entry, value):
+    saved(tmp_path, recording=Recording("arm", 2, 9, "[2]", {"joints": D_O}))
+    rewrite(tmp_path, lambda tensors, config: config["recording"].update({entry: value}))
+    with raises(ValueError, tmp_path):
+        load_policy(tmp_path)

@@ -12,8 +12,8 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from warmprior.checks import check_choice, check_whole_numbers, given
-from warmprior.data.index import DatasetIndex, DemonstrationReader
-from warmprior.data.steps import Storage, StoredActions, read_steps
+from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
+from warmprior.data.steps import Storage, StoredActions, read_steps, target_seen
 from warmprior.io.files import digest_of
 from warmprior.modules.resize import IMAGE_SIZE, Resize
 
@@ -160,6 +160,18 @@ class Demonstrations:
     def origin(self, index: DatasetIndex) -> tuple[dict[str, Any] | None, np.ndarray | None]:
         """Return the rendering options of the images, and the first simulator state, if they are known."""
         return None, None
+
+    def check_targets(self, index: DatasetIndex, steps: TensorDictBase) -> None:
+        """Raise DatasetError if an observation that nobody named holds the action of this or a later step."""
+        if (found := target_seen(index, steps)) is None:
+            return
+        key, later = found
+        others = ", ".join(name for name in index.observation_keys if name != key)
+        when = f"{later} steps later" if later else "of the same step"
+        raise DatasetError(
+            f"{self}: the observation {key!r} holds the action {when}, so a policy would see its own target: "
+            f"name observations without it{f' ({others})' if others else ''}, or name it as well to keep it"
+        )
 
     def digest(self, index: DatasetIndex) -> str:
         """Return the SHA-256 of the contents, and of the mask."""

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice, check_distinct, check_whole_numbers
+from warmprior.checks import check_choice, check_distinct, check_positive, check_whole_numbers, given
 from warmprior.envs.env_args import declared_actions
 from warmprior.envs.tasks import TaskSpec
 from warmprior.modules.resize import Resize
@@ -51,11 +51,15 @@ class DatasetIndex:
         image_shapes: heights and widths of the images to read, as they are stored.
         image_size: side in pixels to which these are resized; 0 if there are none.
         resize: how they are resized, see :func:`~warmprior.modules.resize.resized`.
+        images: the place's own names of images that have another here.
         available_keys: all observations.
+        taken_by: the option that takes an observation if it is not ``"observations"``: ``"images"``, or
+            ``""`` for one that no option takes.
         env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
         whole: False if only some of the demonstrations were asked for.
         rate: control steps per second, if they are known.
+        joints: the observation whose numbers the actions may set, by their names; ``""`` if there is none.
     """
 
     path: Path
@@ -67,12 +71,15 @@ class DatasetIndex:
     image_shapes: tuple[tuple[int, int], ...] = ()
     image_size: int = 0
     resize: Resize = "squeeze"
+    images: Mapping[str, str] = field(default_factory=dict)
     available_keys: tuple[str, ...]
+    taken_by: Mapping[str, str] = field(default_factory=dict)
     action_dim: int
     env_args: dict[str, Any] = field(default_factory=dict)
     task: TaskSpec | None = None
     whole: bool = True
     rate: float | None = None
+    joints: str = ""
 
     def __post_init__(self) -> None:
         if not self.demos:
@@ -80,7 +87,17 @@ class DatasetIndex:
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
+        check_positive(**given(**{f"{self.path}: control steps per second": self.rate}))
         check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
+
+    @property
+    def left_out(self) -> dict[str, list[str]]:
+        """The observations that are not read, by the option that would take them."""
+        others: dict[str, list[str]] = {}
+        for key in self.available_keys:
+            if key not in (*self.observation_keys, *self.image_keys):
+                others.setdefault(self.taken_by.get(key, "observations"), []).append(key)
+        return others
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -38,6 +38,9 @@ from warmprior.modules.real_time_chunking import spliced
 from warmprior.transforms.delay import check_delay, usual_execute
 from warmprior.transforms.history import HistoryObservation
 
+RATES = 0.01
+"""The share by which a robot's rate may differ from that of the demonstrations, such as 30 and 29.97."""
+
 
 class AsyncExecutor:
     """Runs a policy alongside a control loop: the next chunk is computed while the current one is executed.
@@ -69,7 +72,7 @@ class AsyncExecutor:
             ``n_action_steps``), or as many as ``delay`` allows.
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.
-        control_rate: control steps per second.
+        control_rate: control steps per second: those of the demonstrations, if the policy knows them.
         window: the expected delay is the largest of this many recent ones.
         observation_steps: ``To``; that of the actor's network by default, or 2.
         normalizer: converts raw observations and actions; the actor's own by default. Without one
@@ -128,6 +131,9 @@ class AsyncExecutor:
         check_whole_numbers(0, **given(latency=latency))
         check_not_negative(**given(timeout=timeout))
         check_positive(**given(control_rate=control_rate))
+        recording = getattr(plain, "recording", None)
+        if control_rate and recording and recording.rate:
+            _check_rate(control_rate, recording.rate)
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
         execute = usual_execute(plain, prior, expected) if execute is None else execute
@@ -149,6 +155,7 @@ class AsyncExecutor:
             observation_shapes(actor, prior),
             self._normalizer,
             getattr(encoder_in(actor), "resize", "squeeze"),
+            recording,
         )
         self._sees_history = keys.CONDITIONED in actor.in_keys
         self._owned = None
@@ -194,7 +201,8 @@ class AsyncExecutor:
 
         The observation is a vector ``[d_o]``, or a dictionary or tensordict with the vector ``"state"`` and
         the policy's images under their names, uint8 ``[h, w, 3]`` or ``[3, h, w]``; other entries are
-        ignored. NumPy arrays work too.
+        ignored. The demonstrations' own names work as well: each observation of the vector, and
+        ``"observation.images.front"`` for ``"front_image"``. NumPy arrays work too.
 
         Raises:
             KeyError: if an entry is missing; the executor's state is then unchanged.
@@ -323,6 +331,14 @@ class AsyncExecutor:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def _check_rate(control_rate: float, recorded: float) -> None:
+    if not math.isclose(control_rate, recorded, rel_tol=RATES):
+        raise ValueError(
+            f"control_rate={control_rate:g}, but the demonstrations have {recorded:g} control steps per "
+            "second, and actions are not resampled: run the loop at their rate"
+        )
 
 
 def _steps(delay: float | None, control_rate: float | None) -> int:

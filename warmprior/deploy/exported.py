@@ -7,6 +7,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,11 +29,13 @@ from warmprior.modules.generator import Drawing
 from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior, noise_factor
+from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
 
 FIELDS = {
     *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),
     *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer"),
+    "recording",
 }
 """The entries that the description of an exported policy holds."""
 
@@ -172,6 +175,7 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
             "action_dim": network.action_dim,
             "shapes": {name: list(shape) for name, shape in (observation_shapes(policy) or {}).items()},
             "normalizer": None if policy.normalizer is None else _as_lists(policy.normalizer),
+            "recording": None if policy.recording is None else asdict(policy.recording),
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, lambda target: target.write_bytes(compiled.read_bytes()))
@@ -231,6 +235,7 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
     Attributes:
         prior: the source, of which only the lengths are used.
         normalizer: the policy's normaliser.
+        recording: what it was trained on.
         shapes: the shapes of the observation at one step, by name.
 
     Examples:
@@ -251,6 +256,8 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
         self.in_keys = [self.observation_key, *((keys.HISTORY, name) for name in HISTORY_ENTRIES)]
         self.out_keys = [keys.CHUNK]
         self._inputs = [(tuple(shape), getattr(torch, kind[6:])) for shape, kind in description["inputs"]]
+        recording = description["recording"]
+        self.recording = None if recording is None else Recording(**recording)
         self.normalizer: Normalizer | None = None
         if (stored := description["normalizer"]) is not None:
             self.normalizer = Normalizer.from_config(stored)

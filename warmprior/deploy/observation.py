@@ -16,6 +16,7 @@ from warmprior.modules.encoder import ImageEncoder
 from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
+from warmprior.modules.recording import Recording
 from warmprior.modules.resize import Resize, resized
 from warmprior.transforms.history import HistoryObservation
 
@@ -58,6 +59,7 @@ class RobotObservation:
         shapes: see :func:`observation_shapes`; with ``None`` observations are only copied.
         normalizer: normaliser of vectors.
         resize: how images are resized, see :func:`~warmprior.modules.resize.resized`.
+        recording: the demonstrations' own names of observations, which are known as well.
 
     Raises:
         ValueError: if the normaliser lacks a vector.
@@ -68,8 +70,9 @@ class RobotObservation:
         shapes: Mapping[str, tuple[int, ...]] | None,
         normalizer: Normalizer | None,
         resize: Resize = "squeeze",
+        recording: Recording | None = None,
     ) -> None:
-        self.shapes, self.normalizer, self.resize = shapes, normalizer, resize
+        self.shapes, self.normalizer, self.resize, self.recording = shapes, normalizer, resize, recording
         # A policy with a single vector takes it without a name.
         self._vector = shapes is not None and [len(shape) for shape in shapes.values()] == [1]
         if normalizer is None or shapes is None:
@@ -102,7 +105,7 @@ class RobotObservation:
                     f"{list(self.shapes)}"
                 )
             observation = dict.fromkeys(self.shapes, observation)
-        given = {name: value for name, value in observation.items() if value is not None}
+        given = self._renamed({name: value for name, value in observation.items() if value is not None})
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
         given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
         check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
@@ -110,6 +113,17 @@ class RobotObservation:
             name: _fitted(name, given[name], shape, self.resize) for name, shape in self.shapes.items()
         }
         return next(iter(entries.values())) if self._vector else TensorDict(entries)
+
+    def _renamed(self, given: dict[Any, Any]) -> dict[Any, Any]:
+        """Return entries under the policy's names, which may have those of the demonstrations."""
+        if self.recording is None:
+            return given
+        images = {name: given[own] for name, own in self.recording.names.items() if own in given}
+        parts = {name: (width,) for name, width in self.recording.observations.items()}
+        if not parts or not parts.keys() <= given.keys():
+            return given | images
+        vectors = [_fitted(name, given[name], shape, self.resize) for name, shape in parts.items()]
+        return given | images | {keys.STATE: torch.cat(vectors)}
 
 
 def _copied(name: str, value: Any) -> Tensor:

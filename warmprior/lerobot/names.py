@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
+from typing import Any
+
+ROBOT_STATE = "observation.state"
+"""LeRobot's name of a robot's joints, or of its other numbers."""
 
 _EMPTY = "observation.images.empty_camera_"
 """The beginning of LeRobot's names of cameras that do not exist, whose images it makes itself."""
@@ -38,3 +42,18 @@ def entry_names(features: Iterable[str]) -> dict[str, str]:
     """
     named = short_names(name for name in features if not name.startswith(_EMPTY))
     return {short: name for name, short in named.items()}
+
+
+def named_joints(features: Mapping[str, Any], observed: Container[str]) -> str:
+    """Return the observation with the same names as the actions, which may be its absolute targets.
+
+    It is empty if there is none among those that are observed.
+
+    Examples:
+        >>> from warmprior.lerobot.names import named_joints
+        >>> arm = {"names": ["pan", "lift"]}
+        >>> named_joints({"observation.state": arm, "action": arm}, ["observation.state"])
+        'observation.state'
+    """
+    state, action = (features.get(name, {}).get("names") for name in (ROBOT_STATE, "action"))
+    return ROBOT_STATE if state is not None and state == action and ROBOT_STATE in observed else ""

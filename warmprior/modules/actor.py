@@ -20,6 +20,7 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor
 from warmprior.modules.prior import Prior, Source, noise_factor
 from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.modules.recording import Recording
 from warmprior.modules.registry import Registered, kept_arguments
 
 
@@ -161,6 +162,7 @@ class WarmPriorActor(TensorDictModuleBase):
             base environment and any transforms that convert actions or images.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             for ``python -m warmprior evaluate FOLDER``.
+        recording: what the policy was trained on, saved with it: its observations by name, and their rate.
         generator: random generator of the sampler, which can also be passed per call: ``actor(data,
             generator=...)``.
         observation_key: key of the observation, ``[*B, To, d_o]``, or of a group of observations nested under
@@ -201,6 +203,7 @@ class WarmPriorActor(TensorDictModuleBase):
         guidance: RealTimeChunking | None = None,
         normalizer: Normalizer | None = None,
         environment: Mapping[str, Any] | None = None,
+        recording: Recording | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey = keys.OBSERVATION,
         history_key: NestedKey = keys.HISTORY,
@@ -234,6 +237,7 @@ class WarmPriorActor(TensorDictModuleBase):
         self.sees_history = observation_key == keys.CONDITIONED
         self.normalizer = normalizer
         self.environment = environment
+        self.recording = recording
         #: Specs of outputs, by their keys.
         self.spec = spec if spec is None or isinstance(spec, Composite) else Composite({chunk_key: spec})
         _, *read_by_flow = self.ode.in_keys

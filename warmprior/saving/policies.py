@@ -26,11 +26,12 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.preconditioning import SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
 from warmprior.modules.trend import RestingAction
 from warmprior.saving.checkpoint import as_key, load_state, save_state
 
-FORMAT = 8
+FORMAT = 9
 """The version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
@@ -126,6 +127,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
+        "recording": None if actor.recording is None else asdict(actor.recording),
         # One precision per part, because half precision is too coarse for statistics.
         "precision": {
             name: str(dtype).removeprefix("torch.")
@@ -364,13 +366,14 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
             options[name] = as_key(value)
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
-    normalizer, start = config["normalizer"], config["start"]
+    normalizer, start, recording = config["normalizer"], config["start"], config["recording"]
     actor = WarmPriorActor(
         from_config(VelocityNetwork, config["network"]),
         from_config(Prior, config["prior"]),
         normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
         start=None if start is None else from_config(StartPoint, start),
         environment=config["environment"],
+        recording=None if recording is None else Recording(**recording),
         **options,
     )
     parts = _parts(actor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
@@ -23,6 +23,7 @@ from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
+from warmprior.modules.recording import AS_RECORDED, Recording
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose
 from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
@@ -31,6 +32,7 @@ from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 if TYPE_CHECKING:  # training on steps in memory needs no reader and no simulator
     from warmprior.data.demonstrations import Demonstrations
+    from warmprior.data.index import DatasetIndex
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ class Task:
         joints: for absolute joint targets, the observation whose numbers the actions set, one by one; actions
             beyond its width are not targets. Or for each action the index in the observation of the number
             that it sets, in the same units, -1 for none. A preconditioned network then learns the motion from
-            there (:class:`~warmprior.RestingJoints`).
+            there (:class:`~warmprior.RestingJoints`). By default ``"observation.state"`` if a LeRobotDataset
+            gives it the names of the actions, and the numbers are near; ``""`` for none.
         actions: the policies' actions: as recorded, or the absolute poses that robosuite's deltas target.
         play: how policies are played; by default as the demonstrations were recorded, if that is known.
 
@@ -103,6 +106,7 @@ class Task:
         make_env: builds the environment in which episodes are played.
         normalizer: converts between raw and normalised units; ``None`` if they are the same.
         facts: facts about the data for results, as JSON.
+        recording: what policies see, what is left out, and what their actions are.
         adapters: transforms directly after the environment, as arguments of
             :func:`~warmprior.policy_transforms`.
         rest: the resting action, for absolute poses and joint targets, see :class:`~warmprior.RestingTrend`.
@@ -115,7 +119,8 @@ class Task:
     Raises:
         FileNotFoundError: if there is no such file or dataset.
         OSError: if a download fails.
-        DatasetError: if the data are invalid, or their images differ from the simulator's.
+        DatasetError: if the data are invalid, their images differ from the simulator's, or an observation
+            that was not named holds the action of the same or a later step.
         ValueError: if name or style cannot be part of a file name, the place holds another task, its actions
             are not near the joints, or an option is unknown or for another environment.
 
@@ -181,6 +186,8 @@ class Task:
             actions=actions,
             storage="memmap" if index.image_keys else "memory",
         )
+        if observations is None:
+            demonstrations.check_targets(index, steps)
         vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
         self.resize = index.resize
         self.name = demonstrations.title if recorded is None else recorded.name
@@ -209,11 +216,15 @@ class Task:
             self.facts |= recorded.facts
             if recorded.poses is not None:
                 self.rest = RestingPose(recorded.poses, self.normalizer)
-        if joints is not None:
-            self.rest = self._joints(index.joint_columns(joints) if isinstance(joints, str) else [*joints])
+        recognised = index.joints if self.rest is None and self.normalizer is not None else ""
+        targets = recognised if joints is None else joints
+        if len(targets):
+            columns = index.joint_columns(targets) if isinstance(targets, str) else [*targets]
+            self.rest = self._joints(columns, needed=joints is not None)
+        self.recording = self._recording(demonstrations.name, index, targets)
 
-    def _joints(self, columns: list[int]) -> RestingJoints:
-        """Return the resting action of joint targets, after checking that actions are near the joints."""
+    def _joints(self, columns: list[int], needed: bool) -> RestingJoints | None:
+        """Return the resting action of joint targets, if actions are near the joints; else ``None``."""
         actions, width = self.data[ACTION], self.vector.shape[-1]
         if self.rest is not None or self.normalizer is None:
             raise ValueError(
@@ -228,12 +239,37 @@ class Task:
             )
         rest = RestingJoints(torch.tensor(columns), self.normalizer)
         worst = rest.farthest(self.vector, actions)
-        if worst is not None:
+        if worst is not None and needed:
             raise ValueError(
                 f"actions of {self.name} are not near the observed numbers they should set, least of all "
                 f"action {worst} (number {columns[worst]} of the observation): use the same order and units"
             )
-        return rest
+        return rest if worst is None else None
+
+    def _recording(self, name: str, index: DatasetIndex, targets: str | Sequence[int]) -> Recording:
+        """Return what policies see of demonstrations, and what is left out."""
+        actions = AS_RECORDED if self.environment is None else "as the recorded environment takes them"
+        if isinstance(self.rest, RestingPose):
+            actions = "absolute poses"
+        elif self.rest is not None:
+            named = targets if isinstance(targets, str) else f"the observation's numbers {list(targets)}"
+            actions = f"absolute targets of {named}"
+        images = {}
+        for key, (height, width) in zip(index.image_keys, index.image_shapes, strict=True):
+            side, way = index.image_size, "padded" if index.resize == "pad" else "squeezed"
+            changed = "" if height == width == side else f" {way} to {side} x {side}"
+            images[key] = f"{height} x {width}{changed}"
+        return Recording(
+            name,
+            self.facts["demonstrations"],
+            self.facts["steps"],
+            f"[{self.data[ACTION].shape[-1]}], {actions}",
+            dict(zip(index.observation_keys, index.observation_dims, strict=True)),
+            images,
+            {key: index.images[key] for key in index.image_keys if key in index.images},
+            index.left_out,
+            index.rate,
+        )
 
     def env(
         self,
@@ -322,7 +358,8 @@ class Task:
         part = copy.copy(self)
         part.__dict__.pop("identity", None)
         part.data = self.data[kept]
-        part.facts = self.facts | {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
+        sizes: dict[str, Any] = {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
+        part.facts, part.recording = self.facts | sizes, replace(self.recording, **sizes)
         part.digest = None if self.digest is None else digest_of(self.digest, held_out)
         return part, self.data[left_out]
 

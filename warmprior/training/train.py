@@ -16,7 +16,8 @@ from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
 from warmprior.checks import check_device
-from warmprior.io.distributed import wait_for_leader, world_size
+from warmprior.io.distributed import rank, wait_for_leader, world_size
+from warmprior.io.progress import say
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
@@ -73,6 +74,7 @@ def new_policy(
         # A copy, because the policy moves to the device and the environments' normaliser stays on the CPU.
         normalizer=copy.deepcopy(task.normalizer),
         environment=task.environment,
+        recording=task.recording,
     )
 
 
@@ -124,7 +126,8 @@ def train_policy(
         device: device of the network and, if they fit, the demonstrations.
         compile: True compiles the network with :func:`torch.compile`, which needs a C++ compiler.
         logger: a TorchRL logger, closed at the end.
-        description: label of the progress bar; no bar if ``None``.
+        description: label of the progress bar; no bar if ``None``. With a place, what is used of it and what
+            is left out is said above the bar.
         progress: called with the number of iterations, at the start and after each iteration.
         **sampling: further options of :class:`~warmprior.Sampling`, saved with the policy, such as
             ``max_nfe`` for a field trained at only a few values of ``t``.
@@ -162,6 +165,8 @@ def train_policy(
         raise ValueError("a source or start point that learns before the flow needs see_history=False")
     check_device(device)  # before the demonstrations are read
     task = _task_of(demonstrations, {"observations": observations, "images": images})
+    if description is not None and isinstance(demonstrations, str | Path) and not rank():
+        say(task.recording.text())
     home = torch.device(device)
     if directory is None and world_size() > 1:
         raise ValueError("processes that train together need a directory that all of them see")

@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from lab.demonstrations.tasks import title_of
 from lab.io.files import PartialFailure
 from lab.io.leader import go_on_alone
 from lab.methods.methods import Method
@@ -125,6 +126,8 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
         write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
+        for task in tasks if not all(policy.is_trained for policy in policies) else ():
+            print(f"{title_of(task)}:\n{task.recording.text('--{}')}", flush=True)
 
     failures = {}
     for policy in policies if world_size() > 1 else ():

@@ -41,14 +41,12 @@ from warmprior.data import open_demonstrations
 from warmprior.history import window_history
 from warmprior.lerobot.adapter import with_width
 from warmprior.lerobot.memory import ActionMemory
+from warmprior.lerobot.names import named_joints
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.modules.resize import resized
 from warmprior.saving.policies import NoLargerThan
 from warmprior.training import ema_of, precondition
-
-STATE = "observation.state"
-"""LeRobot's name of a robot's joints."""
 
 
 def training_episodes(meta: Any) -> list[int] | None:
@@ -213,9 +211,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         config, asked = self.config, self.config.joints
         key = asked
         if asked == "auto":
-            names = [dataset_meta.features.get(name, {}).get("names") for name in (STATE, keys.ACTION)]
-            same = names[0] is not None and names[0] == names[1]
-            key = STATE if same and STATE in config.observed else ""
+            key = named_joints(dataset_meta.features, config.observed)
         if key:
             ends = []
             for end in ("min", "max"):

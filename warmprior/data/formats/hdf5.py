@@ -7,8 +7,8 @@ reads as zeros. Everything here is opened by :func:`member`, which refuses both.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
@@ -251,15 +251,25 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
     return steps, widths
 
 
-def _is_vector(observations: h5py.Group, key: str) -> bool:
-    """Return True if an observation holds a number or a vector of numbers per step."""
+def _option(observations: h5py.Group, key: str) -> str:
+    """Return the option that takes an observation, for numbers or vectors and for images, or ""."""
     with reading(observations, key):
         item = _follow(observations, key, _MAX_SOFT_LINKS)
-        return (
-            isinstance(item, require("h5py", "sim").Dataset)
-            and len(item.shape or ()) in (1, 2)
-            and item.dtype.kind in "fiub"
-        )
+        if not isinstance(item, require("h5py", "sim").Dataset):
+            return ""
+        if len(item.shape or ()) in (1, 2) and item.dtype.kind in "fiub":
+            return "observations"
+        return "images" if item.dtype == "uint8" and item.ndim == 4 and item.shape[3] == 3 else ""
+
+
+def _others(observations: h5py.Group, keys: Iterable[str]) -> dict[str, str]:
+    """Return the option that takes each observation that is no vector; damage that is not read is none."""
+    options: dict[str, str] = {}
+    for key in keys:
+        options[key] = ""
+        with suppress(DatasetError):
+            options[key] = _option(observations, key)
+    return {key: option for key, option in options.items() if option != "observations"}
 
 
 def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str, tuple[int, int]]:
@@ -382,7 +392,7 @@ class RobomimicDemonstrations(Demonstrations):
                 # Joints and velocities of a robot say again where its gripper is.
                 known = {key.partition("_")[0] for key in usual} - {"object"}
                 others = [k for k in available if k not in usual and k.partition("_")[0] not in known]
-                keys = (*usual, *(key for key in others if _is_vector(group, key)))
+                keys = (*usual, *(key for key in others if _option(group, key) == "observations"))
             obs_names = [f"obs/{key}" for key in keys]
             if poses:
                 actions = member(file, f"data/{selected[0]}/actions", "dataset")
@@ -421,6 +431,7 @@ class RobomimicDemonstrations(Demonstrations):
                         "them again, or leave the demo out"
                     )
                 shapes = sizes
+            taken_by = {} if group is None else _others(group, set(available) - {*keys, *images})
             if self.mask is None and self.demos is None:
                 _check_total(file, sum(lengths))
         return DatasetIndex(
@@ -431,6 +442,7 @@ class RobomimicDemonstrations(Demonstrations):
             observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
             **self.pictured(images, shapes),
             available_keys=available,
+            taken_by=taken_by,
             action_dim=widths["actions"],
             env_args=env_args,
             task=task,

@@ -23,7 +23,7 @@ from warmprior.data.index import (
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
-from warmprior.lerobot.names import short_names
+from warmprior.lerobot.names import ROBOT_STATE, named_joints, short_names
 
 if TYPE_CHECKING:
     from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 DESCRIPTION = "meta/warmprior.json"
 """The file that :func:`warmprior.data.convert_robomimic` adds to LeRobot's own, and that LeRobot ignores."""
 
-ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
 REWARD, SUCCESS = "next.reward", "next.success"
+_COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 _ARM_ACTIONS = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 
 LEROBOT_VERSION = "v3.0"
@@ -75,14 +76,12 @@ class LeRobotIndex(DatasetIndex):
         metadata: LeRobot's own ``LeRobotDatasetMetadata``.
         episodes: the rows of ``meta/episodes`` of the selected episodes.
         columns: for each observation, the feature that holds it and its columns there.
-        images: the feature of each image to read.
         described: the content of ``meta/warmprior.json``; empty for datasets that were not converted.
     """
 
     metadata: Any
     episodes: tuple[Mapping[str, Any], ...]
     columns: Mapping[str, tuple[str, slice]]
-    images: Mapping[str, str]
     described: Mapping[str, Any]
 
     @property
@@ -295,6 +294,10 @@ def read_lerobot_index(
         rows = [row for row in rows if row["episode_index"] in chosen]
     check_count(root, demonstrations.demos, len(rows))
     rows = rows[: demonstrations.demos]
+    others = [name for name in metadata.features if name not in widths and name not in cameras.values()]
+    # A feature is no observation of its own if it is a step's number, or a converted one's parts have names.
+    parts_of = {feature for feature, _ in named.values()}
+    hidden = {name for name in metadata.features if name in parts_of | _COUNTERS or name.startswith("next.")}
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),
@@ -304,7 +307,8 @@ def read_lerobot_index(
         **demonstrations.pictured(
             images, {key: _image_shape(root, metadata.features, cameras, key) for key in images}
         ),
-        available_keys=(*columns, *cameras),
+        available_keys=tuple(name for name in (*columns, *cameras, *others) if name not in hidden),
+        taken_by=dict.fromkeys(cameras, "images") | dict.fromkeys(others, ""),
         action_dim=widths["action"],
         env_args=recorded,
         task=task,
@@ -314,6 +318,7 @@ def read_lerobot_index(
         episodes=tuple(rows),
         columns=columns,
         images={key: cameras[key] for key in images},
+        joints=named_joints(metadata.features, observations),
         described=described,
     )
     parts = product(index.videos, ("chunk", "file"))

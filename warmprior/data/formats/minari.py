@@ -174,7 +174,8 @@ class MinariDemonstrations(Demonstrations):
             observation_keys=chosen,
             observation_dims=tuple(vectors[key] for key in chosen),
             **self.pictured(images, pictures),
-            available_keys=(*vectors, *pictures),
+            available_keys=tuple(spaces),
+            taken_by={key: "images" if key in pictures else "" for key in spaces if key not in vectors},
             action_dim=action.shape[0],
             whole=self.demos in (None, dataset.total_episodes),
         )

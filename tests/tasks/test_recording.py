@@ -1,0 +1,227 @@
+"""What is used of a place and what is not is said before a training, and kept."""
+
+import shlex
+
+import numpy as np
+import pytest
+import torch
+
+from tests.errors import missing, raises
+from warmprior import PastPrior
+from warmprior.__main__ import main
+from warmprior.data import DatasetError, open_demonstrations
+from warmprior.deploy import AsyncExecutor
+from warmprior.saving import load_policy
+from warmprior.tasks import Task
+from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+
+h5py = pytest.importorskip("h5py")
+
+LENGTHS = (12, 15, 9)
+
+
+def robot_file(path, **more):
+    """A robot's own file: vectors, a camera, a text, and what the arguments add, by name."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for i, length in enumerate(LENGTHS):
+            demo = {
+                "actions": rng.normal(size=(length, 3)),
+                "obs/robot0_eef_pos": rng.normal(size=(length, 3)),
+                "obs/robot0_gripper_qpos": rng.normal(size=(length, 2)),
+                "obs/robot0_ft": rng.normal(size=(length, 6)),
+                "obs/force": rng.normal(size=length),
+                "obs/wrist": np.zeros((length, 6, 8, 3), np.uint8),
+                "obs/depth": np.zeros((length, 6, 8), np.float32),
+            }
+            demo |= {f"obs/{name}": make(demo["actions"]) for name, make in more.items()}
+            for name, value in demo.items():
+                file[f"data/demo_{i}/{name}"] = value
+    return path
+
+
+def lines_of(text):
+    return dict(line.split(maxsplit=1) for line in text.replace("left out", "left_out").splitlines())
+
+
+def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --held-out 1"
+    assert main(words.split()) == 0
+    said = lines_of("\n".join(capsys.readouterr().out.splitlines()[:5]))
+    assert said["observations"] == "robot0_eef_pos [3], robot0_gripper_qpos [2], force [1]"
+    assert said["images"] == "none"
+    assert not missing(said["left_out"], "robot0_ft (--observations)", "wrist (--images)", "depth (no option")
+    assert not missing(said["actions"], "[3]", "recorded")
+    assert not missing(said["trained"], "arm.hdf5", "2 demonstrations", "27 steps")
+
+
+def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
+    task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
+    recording = task.recording
+    assert list(recording.observations.items()) == [("robot0_ft", 6), ("force", 1)]
+    assert recording.left_out["observations"] == ["robot0_eef_pos", "robot0_gripper_qpos"]
+    assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "4 x 4")
+    assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
+
+
+def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    options = {"network": NetworkOptions(hidden_dim=8), "training": TrainingConfig(iterations=1)}
+    train_policy(path, PastPrior(4), description=None, **options)
+    assert not capsys.readouterr().err
+    train_policy(path, PastPrior(4), **options)
+    assert not missing(capsys.readouterr().err, "robot0_ft (observations=)", "wrist (images=)")
+
+
+def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import numbers, write_lerobot
+
+    features = {"observation.state": numbers(6), "observation.effort": numbers(6), "action": numbers(6)}
+    write_lerobot(tmp_path / "arm", (8, 8), features, images=[("front", "image")], fps=30)
+    recording = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}")).recording
+    assert recording.observations == {"observation.state": 6} and recording.rate == 30
+    assert recording.left_out == {"observations": ["observation.effort"], "images": ["front_image"]}
+    seeing = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}"), images=["observation.images.front"])
+    assert seeing.recording.names == {"front_image": "observation.images.front"}
+    assert "images" not in seeing.recording.left_out
+
+
+def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):
+    pytest.importorskip("lerobot.datasets")
+    pytest.importorskip("robosuite")
+    from tests.data.synthetic import write_robomimic_file
+    from warmprior.data import convert_robomimic
+
+    write_robomimic_file(tmp_path / "lift.hdf5", task="lift")
+    folder = convert_robomimic(tmp_path / "lift.hdf5", tmp_path / "lift")
+    file, dataset = (Task(open_demonstrations(p)) for p in (tmp_path / "lift.hdf5", f"lerobot:{folder}"))
+    assert dataset.recording.observations == file.recording.observations
+    assert dataset.recording.left_out == {} and dataset.recording.rate == 20
+    assert file.recording.left_out == {"images": ["agentview_image"], "observations": ["robot0_eef_vel_lin"]}
+
+
+def moved(steps):
+    """The actions of some steps later (or before, if negative), where the episode has them."""
+    return lambda actions: actions[np.clip(np.arange(len(actions)) + steps, 0, len(actions) - 1)]
+
+
+SEEN = {
+    "actions": moved(0),
+    "next_actions": moved(1),
+    "targets": lambda actions: np.concatenate([actions, np.ones((len(actions), 2))], 1),
+    "command": lambda actions: actions[:, 1],
+}
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp_path, name):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", **{name: SEEN[name]}))
+    with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
+        Task(demonstrations)
+    named = ["robot0_eef_pos", name]
+    assert list(Task(demonstrations, observations=named).recording.observations) == named
+
+
+@pytest.mark.parametrize("make", [moved(-1), lambda actions: np.ones((len(actions), 3))])
+def test_a_state_that_reaches_the_last_target_is_no_target(tmp_path, make):
+    """Nor is a number that never changes, even if an action is the same."""
+    path = robot_file(tmp_path / "arm.hdf5", joints=make)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            actions = demo["actions"][()]
+            actions[:, 2] = 1
+            demo["actions"][...] = actions
+    assert Task(open_demonstrations(path)).recording.observations["joints"] == 3
+
+
+JOINTS = [f"joint_{i}.pos" for i in range(6)]
+
+
+def arm(root, names=JOINTS, near=0.05):
+    """A dataset of an arm whose actions are targets near its joints, under the same names."""
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
+
+    features = {"observation.state": numbers(6, JOINTS), "action": numbers(6, names)}
+    values = write_lerobot(root, (30, 30), features, fps=30)
+    targets = 40 * (values["observation.state"] + near * values["action"])
+    edit_table(root / "data/chunk-000/file-000.parquet", action=lambda _: list(targets.astype(np.float32)))
+    scaled = 40 * values["observation.state"]
+    edit_table(
+        root / "data/chunk-000/file-000.parquet",
+        observation__state=lambda _: list(scaled.astype(np.float32)),
+    )
+    return f"lerobot:{root}"
+
+
+def test_absolute_joint_targets_are_recognised_said_and_saved(tmp_path, capsys):
+    place = arm(tmp_path / "arm")
+    words = ["train", place, "--iterations", "1", "--hidden-dim", "8", "--out", str(tmp_path)]
+    assert main(words) == 0
+    *said, folder = capsys.readouterr().out.splitlines()
+    assert not missing(lines_of("\n".join(said[:5]))["actions"], "[6]", "observation.state")
+    assert load_policy(folder).network.trend.rest.columns.tolist() == list(range(6))
+    by_hand = Task(open_demonstrations(place), joints="observation.state")
+    assert Task(open_demonstrations(place)).identity == by_hand.identity
+    assert Task(open_demonstrations(place), joints="").rest is None
+
+
+@pytest.mark.parametrize(("names", "near"), [([f"target_{i}" for i in range(6)], 0.05), (JOINTS, 3.0)])
+def test_other_actions_are_as_recorded(tmp_path, names, near):
+    demonstrations = open_demonstrations(arm(tmp_path / "arm", names, near))
+    task = Task(demonstrations)
+    assert task.rest is None and not missing(task.recording.text(), "joints=")
+    if near > 1:
+        with raises(ValueError, "observation", "units"):
+            Task(demonstrations, joints="observation.state")
+
+
+def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_path, capsys):
+    """In the order of the training, and at its rate, which the executor holds it to."""
+    pytest.importorskip("lerobot.datasets")
+    from tests.data.lerobot_parts import numbers, write_lerobot
+
+    widths = {"observation.effort": 2, "observation.state": 6, "action": 6}
+    features = {name: numbers(width) for name, width in widths.items()}
+    write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
+    words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
+    words += " --observations observation.state observation.effort --images observation.images.front"
+    assert main(words.split()) == 0
+    folder = capsys.readouterr().out.splitlines()[-1]
+    assert main(["info", folder]) == 0
+    said = lines_of(capsys.readouterr().out.replace("written by", "written_by"))
+    assert said["observations"] == "observation.state [6], observation.effort [2]"
+    assert not missing(said["takes"], "state (8,)", "front_image (3, 32, 32)")
+    assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
+    assert not missing(said["trained"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
+
+    policy, rng = load_policy(folder), np.random.default_rng(0)
+    state, effort = rng.normal(size=6), rng.normal(size=2).astype(np.float32)
+    image = rng.integers(0, 256, (48, 64, 3), np.uint8)
+    ours = {"state": np.concatenate([state, effort]), "front_image": image}
+    theirs = {"observation.effort": effort, "observation.state": state, "observation.images.front": image}
+    actions = []
+    for observation in (ours, theirs):
+        torch.manual_seed(0)
+        with AsyncExecutor(policy, latency=0, control_rate=29.97) as executor:
+            actions.append(executor.act(observation))
+            with raises(KeyError, "front_image"):
+                executor.act({name: value for name, value in observation.items() if "front" not in name})
+    assert torch.equal(*actions)
+    with raises(ValueError, "observation.state", 6), AsyncExecutor(policy, latency=0) as executor:
+        executor.act(theirs | {"observation.state": effort})
+    with raises(ValueError, "control_rate=50", 30):
+        AsyncExecutor(policy, control_rate=50)
+
+
+def test_the_next_command_of_a_training_without_an_environment_runs_as_it_is_printed(tmp_path, capsys):
+    path = robot_file(tmp_path / "arm.hdf5")
+    out = tmp_path / "my arm's runs"
+    assert main(["train", str(path), "--iterations", "1", "--hidden-dim", "8", "--out", str(out)]) == 0
+    *_, line, folder = capsys.readouterr().out.splitlines()
+    words = shlex.split(line[line.index("python -m") : line.index(";")])
+    assert words == ["python", "-m", "warmprior", "info", folder]
+    assert main(words[3:]) == 0

@@ -1,0 +1,82 @@
+"""What a policy is trained on: what it sees, what is left out, and what its actions are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from warmprior.checks import check_positive, check_whole_numbers, given
+
+AS_RECORDED = "as recorded"
+"""The end of the words for actions whose meaning is unknown."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a policy is trained on, as JSON holds it.
+
+    Attributes:
+        name: name of the demonstrations.
+        demonstrations: their number.
+        steps: their number of steps.
+        actions: what the actions are, in words.
+        observations: the width of each observation, in the order of the policy's vector.
+        images: the size of each image in words.
+        names: the dataset's own names of images that have another here.
+        left_out: what the policy does not see, by the option that would take it, or under no name.
+        rate: control steps per second, if they are known.
+
+    Raises:
+        ValueError: if an entry has another form.
+
+    Examples:
+        >>> from warmprior.modules.recording import Recording
+        >>> print(Recording("so101", 2, 60, "[6], as recorded", {"state": 6}, left_out={"images": ["front"]}))
+        observations  state [6]
+        images        none
+        left out      front (images=)
+        actions       [6], as recorded (joints= names what absolute joint targets set)
+        trained on    so101: 2 demonstrations, 60 steps
+    """
+
+    name: str
+    demonstrations: int
+    steps: int
+    actions: str
+    observations: Mapping[str, int]
+    images: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    rate: float | None = None
+
+    def __post_init__(self) -> None:
+        counts = {"demonstrations": self.demonstrations, "steps": self.steps, **self.observations}
+        check_whole_numbers(0, **counts)
+        check_positive(**given(rate=self.rate))
+        texts = [self.name, self.actions, *self.images.values(), *self.names.values()]
+        texts += [name for names in self.left_out.values() for name in names]
+        if wrong := [text for text in texts if not isinstance(text, str)]:
+            raise ValueError(f"names of a recording must be text, got {wrong[0]!r}")
+
+    def lines(self, option: str = "{}=") -> dict[str, str]:
+        """Return the lines to print by their titles; ``option`` is the form of an option's name."""
+        left_out = [
+            f"{', '.join(names)} ({option.format(taken_by) if taken_by else 'no option takes it'})"
+            for taken_by, names in self.left_out.items()
+        ]
+        hint = f" ({option.format('joints')} names what absolute joint targets set)"
+        rate = {} if self.rate is None else {"rate": f"{self.rate:g} control steps per second"}
+        return {
+            "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
+            "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
+            "left out": "; ".join(left_out) or "nothing",
+            "actions": self.actions + (hint if self.actions.endswith(AS_RECORDED) else ""),
+            **rate,
+            "trained on": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps",
+        }
+
+    def text(self, option: str = "{}=") -> str:
+        """Return :meth:`lines` below each other."""
+        return "\n".join(f"{title:13} {line}" for title, line in self.lines(option).items())
+
+    __str__ = text
