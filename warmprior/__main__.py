@@ -74,14 +74,13 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     shapes, sampling, guidance = observation_shapes(actor), actor.sampling, actor.ode.guidance
     networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
     file = policy_file(folder, revision=revision)
-    noise = "" if sampling.temperature is None else f", temperature {sampling.temperature:g}"
     for name, value in {
         "takes": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
         **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
         "source": actor.prior,
         "start": actor.start or "the source",
-        "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid{noise}",
-        **given(guidance=guidance),
+        "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid",
+        **given(temperature=sampling.temperature, guidance=guidance),
         "network": f"{', '.join(networks)} ({count:,} parameters)",
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",

@@ -53,7 +53,7 @@ def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, 
     assert said["images"] == "none"
     assert not missing(said["left_out"], "robot0_ft (--observations)", "wrist (--images)", "depth (no option")
     assert not missing(said["actions"], "[3]", "recorded")
-    assert not missing(said["trained"], "arm.hdf5", "2 demonstrations", "27 steps")
+    assert not missing(said["data"], "arm.hdf5", "2 demonstrations", "27 steps")
 
 
 def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
@@ -121,8 +121,17 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", **{name: SEEN[name]}))
     with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
         Task(demonstrations)
+    with raises(DatasetError, f"'{name}'"):
+        Task(demonstrations, joints="robot0_eef_pos")
     named = ["robot0_eef_pos", name]
     assert list(Task(demonstrations, observations=named).recording.observations) == named
+
+
+def test_who_names_the_joints_wants_to_see_them(tmp_path):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", joints=moved(0)))
+    with raises(DatasetError, "'joints'"):
+        Task(demonstrations)
+    assert Task(demonstrations, joints="joints").recording.observations["joints"] == 3
 
 
 @pytest.mark.parametrize("make", [moved(-1), lambda actions: np.ones((len(actions), 3))])
@@ -196,7 +205,7 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert said["observations"] == "observation.state [6], observation.effort [2]"
     assert not missing(said["takes"], "state (8,)", "front_image (3, 32, 32)")
     assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
-    assert not missing(said["trained"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
+    assert not missing(said["data"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
 
     policy, rng = load_policy(folder), np.random.default_rng(0)
     state, effort = rng.normal(size=6), rng.normal(size=2).astype(np.float32)

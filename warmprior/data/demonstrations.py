@@ -13,9 +13,15 @@ from tensordict import TensorDictBase
 
 from warmprior.checks import check_choice, check_whole_numbers, given
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
-from warmprior.data.steps import Storage, StoredActions, read_steps, target_seen
+from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
+from warmprior.keys import ACTION, EPISODE, OBSERVATION
+from warmprior.modules.recording import AS_RECORDED, Recording
 from warmprior.modules.resize import IMAGE_SIZE, Resize
+from warmprior.modules.trend import vector_of
+
+ROWS = 2_000  # number of steps that decide if an observation is an action
+LATER = 16  # up to so many steps later, as long as most chunks
 
 
 class Demonstrations:
@@ -42,7 +48,7 @@ class Demonstrations:
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> demonstrations_of(TensorDict(steps, [60]), "pendulum")
-        pendulum: 3 demonstrations, 60 steps; actions [1]; observations observation [3]
+        pendulum: data pendulum: 3 demonstrations, 60 steps; observations observation [3]; images none; ...
     """
 
     prefix: ClassVar[str]
@@ -91,19 +97,25 @@ class Demonstrations:
             index = self.index()
         except (OSError, ValueError, ImportError) as error:
             return f"{self}: {error}"
-        seen = zip(index.observation_keys, index.observation_dims, strict=True)
-        parts = [
-            f"{len(index.demos)} demonstrations, {sum(index.lengths)} steps",
-            f"actions [{index.action_dim}]",
-            f"observations {', '.join(f'{key} [{width}]' for key, width in seen)}",
-        ]
-        if others := [key for key in index.available_keys if key not in index.observation_keys]:
-            parts.append(f"others {', '.join(others)}")
-        if index.rate is not None:
-            parts.append(f"{index.rate:g} steps per second")
+        parts = [" ".join(line) for line in self.recording(index).lines().items()]
         for kind, described in self.environment(index).items():
             parts.append(f"recorded in {kind}'s {described.get('env_name', described.get('id'))}")
         return f"{self}: {'; '.join(parts)}"
+
+    def recording(self, index: DatasetIndex, actions: str | None = None) -> Recording:
+        """Return what is read of the demonstrations, what is left out, and what ``actions`` are, in words."""
+        side, shapes = index.image_size, zip(index.image_keys, index.image_shapes, strict=True)
+        return Recording(
+            self.name,
+            len(index.demos),
+            sum(index.lengths),
+            actions or f"[{index.action_dim}]{AS_RECORDED}",
+            dict(zip(index.observation_keys, index.observation_dims, strict=True)),
+            {key: f"{height} x {width}, seen at {side} x {side}" for key, (height, width) in shapes},
+            {key: index.images[key] for key in index.image_keys if key in index.images},
+            index.left_out,
+            index.rate,
+        )
 
     def first(self, demos: int) -> Self:
         """Return the first `demos` of these demonstrations."""
@@ -161,17 +173,27 @@ class Demonstrations:
         """Return the rendering options of the images, and the first simulator state, if they are known."""
         return None, None
 
-    def check_targets(self, index: DatasetIndex, steps: TensorDictBase) -> None:
-        """Raise DatasetError if an observation that nobody named holds the action of this or a later step."""
-        if (found := target_seen(index, steps)) is None:
-            return
-        key, later = found
-        others = ", ".join(name for name in index.observation_keys if name != key)
-        when = f"{later} steps later" if later else "of the same step"
-        raise DatasetError(
-            f"{self}: the observation {key!r} holds the action {when}, so a policy would see its own target: "
-            f"name observations without it{f' ({others})' if others else ''}, or name it as well to keep it"
-        )
+    def check_targets(self, index: DatasetIndex, steps: TensorDictBase, named: Any = None) -> None:
+        """Check all observations but the named one: none may hold an action of the same or a later step.
+
+        A number that equals one dimension of the action at every step, and changes, is refused. A state that
+        reaches the last target equals an earlier action.
+        """
+        keys, first = np.repeat(index.observation_keys, index.observation_dims).tolist(), steps[:ROWS]
+        seen, action, episode = vector_of(first[OBSERVATION]), first[ACTION], first[EPISODE]
+        # So that half of the steps are compared at least.
+        for later in range(min(LATER, 1 + min(index.lengths) // 2)):
+            rows = episode[later:] == episode[: len(episode) - later]
+            now, then = seen[: len(rows)][rows], action[later:][rows]
+            for target in then.mT[(then != then[:1]).any(0)]:
+                equal = (now == target.unsqueeze(-1)).all(0).tolist()
+                if held := [key for key, same in zip(keys, equal, strict=True) if same and key != named]:
+                    others = [key for key in index.observation_keys if key not in held]
+                    when = f"{later} steps later" if later else "of the same step"
+                    raise DatasetError(
+                        f"{self}: the observation {held[0]!r} holds the action {when}, its own target: "
+                        f"name observations without it ({', '.join(others) or 'none'}), or with it to keep it"
+                    )
 
     def digest(self, index: DatasetIndex) -> str:
         """Return the SHA-256 of the contents, and of the mask."""

@@ -53,8 +53,8 @@ class DatasetIndex:
         resize: how they are resized, see :func:`~warmprior.modules.resize.resized`.
         images: the place's own names of images that have another here.
         available_keys: all observations.
-        taken_by: the option that takes an observation if it is not ``"observations"``: ``"images"``, or
-            ``""`` for one that no option takes.
+        taken_by: the option that takes an observation: ``"observations"`` by default, ``"images"``, or ``""``
+            for one that no option takes.
         env_args: the description of the environment; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
         whole: False if only some of the demonstrations were asked for.
@@ -94,9 +94,8 @@ class DatasetIndex:
     def left_out(self) -> dict[str, list[str]]:
         """The observations that are not read, by the option that would take them."""
         others: dict[str, list[str]] = {}
-        for key in self.available_keys:
-            if key not in (*self.observation_keys, *self.image_keys):
-                others.setdefault(self.taken_by.get(key, "observations"), []).append(key)
+        for key in sorted(set(self.available_keys) - {*self.observation_keys, *self.image_keys}):
+            others.setdefault(self.taken_by.get(key, "observations"), []).append(key)
         return others
 
     @property

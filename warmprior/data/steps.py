@@ -60,34 +60,6 @@ def read_steps(
     return data
 
 
-ROWS = 2_000  # number of steps that decide if an observation is an action
-LATER = 16  # up to so many steps later, as long as most chunks
-
-
-def target_seen(index: DatasetIndex, steps: TensorDictBase) -> tuple[str, int] | None:
-    """Return an observation with a number that is the action of a later step, and how many steps later.
-
-    The number has to equal one dimension of the action at every step, and to change. A state that reaches the
-    last target equals an earlier action.
-    """
-    keys = [
-        key
-        for key, width in zip(index.observation_keys, index.observation_dims, strict=True)
-        for _ in range(width)
-    ]
-    first = steps[:ROWS]
-    seen, action, episode = first[_vector_key(index)], first[ACTION], first[EPISODE]
-    for later in range(min(LATER, 1 + min(index.lengths) // 2)):  # half of the steps are compared at least
-        kept = len(first) - later
-        rows = episode[later:] == episode[:kept]
-        now, then = seen[:kept][rows], action[later:][rows]
-        for target in then.mT[(then != then[:1]).any(0)]:
-            equal = (now == target.unsqueeze(-1)).all(0)
-            if equal.any():
-                return keys[int(equal.int().argmax())], later
-    return None
-
-
 UNIT_TOLERANCE = 1e-2  # error of a quaternion's length; recorded ones are off by 1e-6
 
 LOOKED_AT = 20  # number of demos that decide if actions are poses

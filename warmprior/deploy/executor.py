@@ -38,9 +38,6 @@ from warmprior.modules.real_time_chunking import spliced
 from warmprior.transforms.delay import check_delay, usual_execute
 from warmprior.transforms.history import HistoryObservation
 
-RATES = 0.01
-"""The share by which a robot's rate may differ from that of the demonstrations, such as 30 and 29.97."""
-
 
 class AsyncExecutor:
     """Runs a policy alongside a control loop: the next chunk is computed while the current one is executed.
@@ -132,8 +129,13 @@ class AsyncExecutor:
         check_not_negative(**given(timeout=timeout))
         check_positive(**given(control_rate=control_rate))
         recording = getattr(plain, "recording", None)
-        if control_rate and recording and recording.rate:
-            _check_rate(control_rate, recording.rate)
+        rate = None if recording is None else recording.rate
+        # Rates of cameras are rounded: 29.97 is 30.
+        if control_rate and rate and not math.isclose(control_rate, rate, rel_tol=0.01):
+            raise ValueError(
+                f"control_rate={control_rate:g}, but the demonstrations have {rate:g} control steps per "
+                "second, and actions are not resampled: run the loop at their rate"
+            )
         length = prior.prediction_length
         expected = _steps(delay, control_rate) if latency is None else latency
         execute = usual_execute(plain, prior, expected) if execute is None else execute
@@ -331,14 +333,6 @@ class AsyncExecutor:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def _check_rate(control_rate: float, recorded: float) -> None:
-    if not math.isclose(control_rate, recorded, rel_tol=RATES):
-        raise ValueError(
-            f"control_rate={control_rate:g}, but the demonstrations have {recorded:g} control steps per "
-            "second, and actions are not resampled: run the loop at their rate"
-        )
 
 
 def _steps(delay: float | None, control_rate: float | None) -> int:

@@ -34,8 +34,7 @@ from warmprior.modules.registry import from_config
 
 FIELDS = {
     *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),
-    *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer"),
-    "recording",
+    *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer", "recording"),
 }
 """The entries that the description of an exported policy holds."""
 
@@ -256,8 +255,7 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
         self.in_keys = [self.observation_key, *((keys.HISTORY, name) for name in HISTORY_ENTRIES)]
         self.out_keys = [keys.CHUNK]
         self._inputs = [(tuple(shape), getattr(torch, kind[6:])) for shape, kind in description["inputs"]]
-        recording = description["recording"]
-        self.recording = None if recording is None else Recording(**recording)
+        self.recording = description["recording"] and Recording(**description["recording"])
         self.normalizer: Normalizer | None = None
         if (stored := description["normalizer"]) is not None:
             self.normalizer = Normalizer.from_config(stored)

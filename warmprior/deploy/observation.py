@@ -105,7 +105,8 @@ class RobotObservation:
                     f"{list(self.shapes)}"
                 )
             observation = dict.fromkeys(self.shapes, observation)
-        given = self._renamed({name: value for name, value in observation.items() if value is not None})
+        given = {name: value for name, value in observation.items() if value is not None}
+        given = given if self.recording is None else self._renamed(given, self.recording)
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
         given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
         check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
@@ -114,16 +115,14 @@ class RobotObservation:
         }
         return next(iter(entries.values())) if self._vector else TensorDict(entries)
 
-    def _renamed(self, given: dict[Any, Any]) -> dict[Any, Any]:
+    def _renamed(self, given: dict[Any, Any], recording: Recording) -> dict[Any, Any]:
         """Return entries under the policy's names, which may have those of the demonstrations."""
-        if self.recording is None:
-            return given
-        images = {name: given[own] for name, own in self.recording.names.items() if own in given}
-        parts = {name: (width,) for name, width in self.recording.observations.items()}
-        if not parts or not parts.keys() <= given.keys():
-            return given | images
-        vectors = [_fitted(name, given[name], shape, self.resize) for name, shape in parts.items()]
-        return given | images | {keys.STATE: torch.cat(vectors)}
+        images = {name: given[own] for name, own in recording.names.items() if own in given}
+        parts = {name: (width,) for name, width in recording.observations.items()}
+        if parts and parts.keys() <= given.keys():
+            vectors = [_fitted(name, given[name], shape, self.resize) for name, shape in parts.items()]
+            given = given | {keys.STATE: torch.cat(vectors)}
+        return given | images
 
 
 def _copied(name: str, value: Any) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 from tqdm import tqdm
@@ -15,8 +14,3 @@ def progress_bar(description: str | None, *args: Any, **options: Any) -> Any:
     """
     hidden = {"disable": True} if description is None else {}
     return tqdm(*args, desc=description, **options, **hidden)
-
-
-def say(text: str) -> None:
-    """Write lines above the bars, to standard error."""
-    tqdm.write(text, file=sys.stderr)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 from warmprior.checks import check_positive, check_whole_numbers, given
 
-AS_RECORDED = "as recorded"
+AS_RECORDED = ", as recorded"
 """The end of the words for actions whose meaning is unknown."""
 
 
@@ -31,12 +32,14 @@ class Recording:
 
     Examples:
         >>> from warmprior.modules.recording import Recording
-        >>> print(Recording("so101", 2, 60, "[6], as recorded", {"state": 6}, left_out={"images": ["front"]}))
+        >>> seen = Recording("so101", 2, 60, "[6], as recorded", {"state": 6}, left_out={"images": ["front"]})
+        >>> print(seen.text())
+        data          so101: 2 demonstrations, 60 steps
         observations  state [6]
         images        none
         left out      front (images=)
         actions       [6], as recorded (joints= names what absolute joint targets set)
-        trained on    so101: 2 demonstrations, 60 steps
+        rate          unknown
     """
 
     name: str
@@ -53,10 +56,9 @@ class Recording:
         counts = {"demonstrations": self.demonstrations, "steps": self.steps, **self.observations}
         check_whole_numbers(0, **counts)
         check_positive(**given(rate=self.rate))
-        texts = [self.name, self.actions, *self.images.values(), *self.names.values()]
-        texts += [name for names in self.left_out.values() for name in names]
-        if wrong := [text for text in texts if not isinstance(text, str)]:
-            raise ValueError(f"names of a recording must be text, got {wrong[0]!r}")
+        texts = *self.images.values(), *self.names.values(), *chain(*self.left_out.values())
+        if not all(isinstance(text, str) for text in (self.name, self.actions, *texts)):
+            raise ValueError(f"names of a recording must be text, got {self}")
 
     def lines(self, option: str = "{}=") -> dict[str, str]:
         """Return the lines to print by their titles; ``option`` is the form of an option's name."""
@@ -65,18 +67,15 @@ class Recording:
             for taken_by, names in self.left_out.items()
         ]
         hint = f" ({option.format('joints')} names what absolute joint targets set)"
-        rate = {} if self.rate is None else {"rate": f"{self.rate:g} control steps per second"}
         return {
+            "data": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps",
             "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
             "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
             "left out": "; ".join(left_out) or "nothing",
             "actions": self.actions + (hint if self.actions.endswith(AS_RECORDED) else ""),
-            **rate,
-            "trained on": f"{self.name}: {self.demonstrations} demonstrations, {self.steps:,} steps",
+            "rate": "unknown" if self.rate is None else f"{self.rate:g} control steps per second",
         }
 
     def text(self, option: str = "{}=") -> str:
         """Return :meth:`lines` below each other."""
         return "\n".join(f"{title:13} {line}" for title, line in self.lines(option).items())
-
-    __str__ = text

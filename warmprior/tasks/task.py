@@ -23,7 +23,7 @@ from warmprior.keys import ACTION, CHUNK, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.normalize import Normalizer, bound_of
 from warmprior.modules.prior import GaussianPrior, Prior
-from warmprior.modules.recording import AS_RECORDED, Recording
+from warmprior.modules.recording import AS_RECORDED
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose
 from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.absolute_actions import Actions
@@ -32,7 +32,6 @@ from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 if TYPE_CHECKING:  # training on steps in memory needs no reader and no simulator
     from warmprior.data.demonstrations import Demonstrations
-    from warmprior.data.index import DatasetIndex
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ class Task:
             storage="memmap" if index.image_keys else "memory",
         )
         if observations is None:
-            demonstrations.check_targets(index, steps)
+            demonstrations.check_targets(index, steps, joints)  # who names the joints wants them
         vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
         self.resize = index.resize
         self.name = demonstrations.title if recorded is None else recorded.name
@@ -216,12 +215,14 @@ class Task:
             self.facts |= recorded.facts
             if recorded.poses is not None:
                 self.rest = RestingPose(recorded.poses, self.normalizer)
-        recognised = index.joints if self.rest is None and self.normalizer is not None else ""
-        targets = recognised if joints is None else joints
+        targets = index.joints if joints is None else joints
         if len(targets):
             columns = index.joint_columns(targets) if isinstance(targets, str) else [*targets]
             self.rest = self._joints(columns, needed=joints is not None)
-        self.recording = self._recording(demonstrations.name, index, targets)
+        words = AS_RECORDED if self.environment is None else ", as the recorded environment takes them"
+        if self.rest is not None:
+            words = f", absolute targets of {targets}" if len(targets) else ", absolute poses"
+        self.recording = demonstrations.recording(index, f"[{self.data[ACTION].shape[-1]}]{words}")
 
     def _joints(self, columns: list[int], needed: bool) -> RestingJoints | None:
         """Return the resting action of joint targets, if actions are near the joints; else ``None``."""
@@ -245,31 +246,6 @@ class Task:
                 f"action {worst} (number {columns[worst]} of the observation): use the same order and units"
             )
         return rest if worst is None else None
-
-    def _recording(self, name: str, index: DatasetIndex, targets: str | Sequence[int]) -> Recording:
-        """Return what policies see of demonstrations, and what is left out."""
-        actions = AS_RECORDED if self.environment is None else "as the recorded environment takes them"
-        if isinstance(self.rest, RestingPose):
-            actions = "absolute poses"
-        elif self.rest is not None:
-            named = targets if isinstance(targets, str) else f"the observation's numbers {list(targets)}"
-            actions = f"absolute targets of {named}"
-        images = {}
-        for key, (height, width) in zip(index.image_keys, index.image_shapes, strict=True):
-            side, way = index.image_size, "padded" if index.resize == "pad" else "squeezed"
-            changed = "" if height == width == side else f" {way} to {side} x {side}"
-            images[key] = f"{height} x {width}{changed}"
-        return Recording(
-            name,
-            self.facts["demonstrations"],
-            self.facts["steps"],
-            f"[{self.data[ACTION].shape[-1]}], {actions}",
-            dict(zip(index.observation_keys, index.observation_dims, strict=True)),
-            images,
-            {key: index.images[key] for key in index.image_keys if key in index.images},
-            index.left_out,
-            index.rate,
-        )
 
     def env(
         self,

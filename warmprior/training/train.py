@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -13,11 +14,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.record.loggers.common import Logger
+from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.checks import check_device
 from warmprior.io.distributed import rank, wait_for_leader, world_size
-from warmprior.io.progress import say
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
@@ -166,7 +167,7 @@ def train_policy(
     check_device(device)  # before the demonstrations are read
     task = _task_of(demonstrations, {"observations": observations, "images": images})
     if description is not None and isinstance(demonstrations, str | Path) and not rank():
-        say(task.recording.text())
+        tqdm.write(task.recording.text(), file=sys.stderr)
     home = torch.device(device)
     if directory is None and world_size() > 1:
         raise ValueError("processes that train together need a directory that all of them see")

@@ -262,14 +262,13 @@ def _option(observations: h5py.Group, key: str) -> str:
         return "images" if item.dtype == "uint8" and item.ndim == 4 and item.shape[3] == 3 else ""
 
 
-def _others(observations: h5py.Group, keys: Iterable[str]) -> dict[str, str]:
-    """Return the option that takes each observation that is no vector; damage that is not read is none."""
-    options: dict[str, str] = {}
-    for key in keys:
-        options[key] = ""
+def _options(observations: h5py.Group, keys: Iterable[str]) -> dict[str, str]:
+    """Return the option that takes each observation; what is damaged is read by none."""
+    options = dict.fromkeys(keys, "")
+    for key in options:
         with suppress(DatasetError):
             options[key] = _option(observations, key)
-    return {key: option for key, option in options.items() if option != "observations"}
+    return options
 
 
 def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str, tuple[int, int]]:
@@ -431,7 +430,7 @@ class RobomimicDemonstrations(Demonstrations):
                         "them again, or leave the demo out"
                     )
                 shapes = sizes
-            taken_by = {} if group is None else _others(group, set(available) - {*keys, *images})
+            taken_by = {} if group is None else _options(group, set(available) - {*keys, *images})
             if self.mask is None and self.demos is None:
                 _check_total(file, sum(lengths))
         return DatasetIndex(

@@ -295,9 +295,9 @@ def read_lerobot_index(
     check_count(root, demonstrations.demos, len(rows))
     rows = rows[: demonstrations.demos]
     others = [name for name in metadata.features if name not in widths and name not in cameras.values()]
-    # A feature is no observation of its own if it is a step's number, or a converted one's parts have names.
-    parts_of = {feature for feature, _ in named.values()}
-    hidden = {name for name in metadata.features if name in parts_of | _COUNTERS or name.startswith("next.")}
+    # What counts steps is no observation, nor is a feature whose parts have names of their own.
+    hidden = _COUNTERS | {feature for feature, _ in named.values()}
+    available = [n for n in (*columns, *cameras, *others) if n not in hidden and not n.startswith("next.")]
     index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in rows),
@@ -307,7 +307,7 @@ def read_lerobot_index(
         **demonstrations.pictured(
             images, {key: _image_shape(root, metadata.features, cameras, key) for key in images}
         ),
-        available_keys=tuple(name for name in (*columns, *cameras, *others) if name not in hidden),
+        available_keys=tuple(available),
         taken_by=dict.fromkeys(cameras, "images") | dict.fromkeys(others, ""),
         action_dim=widths["action"],
         env_args=recorded,
