@@ -147,7 +147,8 @@ class WholePolicy(nn.Module):
             check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
         misfit: str | None
         try:
-            with cls.limited_to(weights):
+            # A training that goes on reads its dataset while the policy is built.
+            with cls.limited_to(weights if kwargs.get("dataset_meta") is None else {}):
                 policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
             misfit = policy._misfit
         except RuntimeError as error:
