@@ -49,7 +49,7 @@ def scene(height, width, rng):
 
 @pytest.fixture(scope="module")
 def episodes():
-    """Those of an SO-101: six joints, absolute targets, two cameras of different sizes."""
+    """Return steps like an SO-101's: six joints, absolute targets, two cameras of different sizes."""
     rng, made = np.random.default_rng(0), []
     for length in LENGTHS:
         joints = rng.uniform(-1, 1, (length + 1, 6)).astype(np.float32)

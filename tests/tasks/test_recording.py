@@ -1,4 +1,4 @@
-"""What is used of a place and what is not is said before a training, and kept."""
+"""A training says first what it uses of a place and what it leaves out, and its policy keeps that."""
 
 import shlex
 

@@ -1,4 +1,4 @@
-"""What a policy is trained on: what it sees, what is left out, and what its actions are."""
+"""This module tells what a policy is trained on: what it sees, what is left out, and what its actions are."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ AS_RECORDED = ", as recorded"
 
 @dataclass(frozen=True)
 class Recording:
-    """What a policy is trained on, as JSON holds it.
+    """A description of what a policy is trained on, which JSON can hold.
 
     Attributes:
         name: name of the demonstrations.

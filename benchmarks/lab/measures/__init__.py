@@ -1,1 +1,1 @@
-"""What is measured on policies beside their success, a clock, and intervals."""
+"""This room measures policies beside their success, and has a clock and intervals."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from warmprior.io.files import read_json
+from warmprior.saving.policies import NoLargerThan
 
 HUB = ("token", "cache_dir", "local_files_only", "force_download", "proxies", "revision")
 """Options of a download."""
@@ -91,12 +92,8 @@ class WholePolicy(nn.Module):
 
     config_class: Any
     name: str
+    has_all_weights: ClassVar[bool] = False  # True if the saved weights are all that the policy is built of
     _misfit: ClassVar[str | None] = "no model.safetensors"
-
-    @classmethod
-    def limited_to(cls, weights: Mapping[str, Tensor]) -> AbstractContextManager[Any]:
-        """Return the context in which a policy with these saved weights is built; here without a limit."""
-        return nullcontext()
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and note those that do not fit."""
@@ -148,7 +145,8 @@ class WholePolicy(nn.Module):
         misfit: str | None
         try:
             # A training that goes on reads its dataset while the policy is built.
-            with cls.limited_to(weights if kwargs.get("dataset_meta") is None else {}):
+            limited = cls.has_all_weights and weights and kwargs.get("dataset_meta") is None
+            with NoLargerThan(weights) if limited else nullcontext():
                 policy = super().from_pretrained(place, config=config, **kwargs)  # type: ignore[misc]
             misfit = policy._misfit
         except RuntimeError as error:

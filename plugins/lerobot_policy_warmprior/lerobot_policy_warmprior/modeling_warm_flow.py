@@ -7,7 +7,6 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, cast
 
 import torch
@@ -45,7 +44,6 @@ from warmprior.lerobot.names import named_joints
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.modules.resize import resized
-from warmprior.saving.policies import NoLargerThan
 from warmprior.training import ema_of, precondition
 
 
@@ -81,6 +79,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
 
     config_class = WarmFlowConfig
     name = "warm_flow"
+    has_all_weights = True
     config: WarmFlowConfig
     _memory: ActionMemory
     _fitted: dict[str, Tensor]
@@ -233,11 +232,6 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 )
         config.joints = ""
         return None
-
-    @classmethod
-    def limited_to(cls, weights: Mapping[str, Tensor]) -> AbstractContextManager[Any]:
-        """Refuse to build a network for which the saved weights are far too few."""
-        return NoLargerThan(weights) if weights else nullcontext()
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor], *args: Any, **kwargs: Any) -> Any:
         """Load weights, and keep moments that were fitted to the training data."""
