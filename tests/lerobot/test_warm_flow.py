@@ -385,6 +385,20 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     assert torch.equal(*chunks)
 
 
+def test_joint_targets_need_joints_in_the_units_that_they_were_fitted_in(found, tmp_path, caplog):
+    """RestingJoints maps between minimum and maximum; other units would give other resting actions."""
+    from lerobot.configs.types import NormalizationMode
+
+    joint_dataset(tmp_path / "data")
+    modes = {**found["warm_flow"].config_class().normalization_mapping, "STATE": NormalizationMode.MEAN_STD}
+    options = {"n_action_steps": 4, "normalization_mapping": modes}
+    with caplog.at_level("WARNING"):
+        policy, _ = dataset_policy(found, tmp_path / "data", **options)
+    assert policy.config.joints == "" and "STATE" in caplog.text
+    with raises(ValueError, "STATE", "MIN_MAX", "normalization_mapping"):
+        dataset_policy(found, tmp_path / "data", joints="observation.state", **options)
+
+
 @pytest.mark.parametrize(("names", "near"), [(["x", "y", "z"], True), (JOINTS, False)])
 def test_other_actions_are_no_joint_targets(found, tmp_path, names, near):
     joint_dataset(tmp_path / "data", names, near)

@@ -211,6 +211,14 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         key = asked
         if asked == "auto":
             key = named_joints(dataset_meta.features, config.observed)
+        kinds = {config.input_features[name].type.value for name in config.observed}
+        other = kinds - {k for k, m in config.normalization_mapping.items() if m == NormalizationMode.MIN_MAX}
+        if key and other:
+            why = f"joint targets need {' and '.join(sorted(other))} to be normalised by MIN_MAX"
+            if asked != "auto":
+                raise ValueError(f"{why}: change --policy.normalization_mapping, or set --policy.joints=")
+            logging.warning("%s: the actions count as no targets of %s", why, key)
+            key = ""
         if key:
             ends = []
             for end in ("min", "max"):
