@@ -8,7 +8,7 @@ import pytest
 from tests.errors import raises
 from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
 from tests.states import same
-from warmprior import GaussianPrior, PastPrior, policy_transforms
+from warmprior import GaussianPrior, PastPrior, RealTimeChunking, policy_transforms
 from warmprior.envs.description import registered_description
 from warmprior.evaluation import evaluate, parallel_env
 from warmprior.rl import improve, improve_policy, improved_policy
@@ -114,6 +114,8 @@ def test_a_policy_without_an_environment_is_refused(tmp_path):
         improve_policy(make_actor(), tmp_path, make_env=make_env)
     registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": "is_success"}
     description = registered_description({**registered, "observation_keys": ["observation"]})
+    with raises(ValueError, "guidance=None"):
+        improve_policy(make_actor().replace(guidance=RealTimeChunking(horizon=2)), tmp_path)
     with raises(ValueError, "Gymnasium", "make_env"):
         improve_policy(make_actor().replace(environment=description), tmp_path)
     assert not list(tmp_path.iterdir())

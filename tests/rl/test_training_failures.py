@@ -3,6 +3,7 @@ import torch
 
 from tests.errors import raises
 from tests.rl.training_parts import ALGORITHMS, H, from_step, make_actor, make_config, make_env, make_training
+from tests.toy_env import Halfway
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
 from warmprior.io.files import exclusive
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
@@ -18,6 +19,9 @@ def test_a_state_of_something_else_is_refused(tmp_path):
         "prior": {"actor": make_actor(PastPrior(H, sigma=0.25))},
         "policy": {"actor": make_actor(seed=1)},
         "sampling": {"actor": make_actor().replace(clip=0.5)},
+        "start": {"actor": make_actor().replace(start=Halfway())},
+        "environment": {"actor": make_actor().replace(environment={"env_name": "Other"})},
+        "evaluation_seed": {"collection": {"evaluation_seed": 7}},
     }.items():
         with raises(ValueError, part):
             make_training(tmp_path, **{"environment_steps": 30, **options})

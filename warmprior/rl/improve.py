@@ -18,6 +18,7 @@ from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
+from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
 
 SMALL = PriorSpaceConfig(
@@ -99,7 +100,7 @@ def improve_policy(
 
     Raises:
         ValueError: if the policy keeps no description of a robosuite environment and ``make_env`` is missing,
-            the policy sees images, or the recipe does not fit the policy.
+            the policy is guided, is trained at ``t = 0`` only or sees images, or the recipe does not fit it.
         FloatingPointError: if the training diverges; the last save stays.
 
     Examples:
@@ -126,8 +127,7 @@ def improve_policy(
     from warmprior.envs.tasks import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
-    if getattr(policy.network, "encodes", False):
-        raise ValueError("a policy that sees images cannot be improved: an agent would read features alone")
+    check_improvable(policy)
     if make_env is None and is_registered(policy.environment):
         raise ValueError(
             "the policy's environment is Gymnasium's, whose episodes have no numbers and whose reward may be "

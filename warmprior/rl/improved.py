@@ -98,6 +98,16 @@ def _as_key(key: Any) -> Any:
     return tuple(key) if isinstance(key, list) else key
 
 
+def check_improvable(actor: WarmPriorActor) -> None:
+    """Raise ValueError if no agent can become part of the policy, for its guidance, times or images."""
+    if actor.ode.guidance is not None:
+        raise ValueError("the agent alone must decide the chunk: use actor.replace(guidance=None)")
+    if actor.sampling.max_nfe == 1:
+        raise ValueError("the policy is trained at t = 0 alone, so an agent has no source space to act in")
+    if getattr(actor.network, "encodes", False):
+        raise ValueError("the agent of a policy that sees images reads features, which no policy gives it")
+
+
 def improved_policy(
     actor: WarmPriorActor,
     agent: ProbabilisticTensorDictSequential,
@@ -137,12 +147,7 @@ def improved_policy(
     options = getattr(agent, "options", None)
     if options is None:
         raise TypeError(f"need an agent from make_prior_space_actor, got {type(agent).__name__}")
-    if actor.ode.guidance is not None:
-        raise ValueError("the agent alone must decide the chunk: use actor.replace(guidance=None)")
-    if actor.sampling.max_nfe == 1:
-        raise ValueError("the policy is trained at t = 0 alone, so an agent has no source space to act in")
-    if getattr(actor.network, "encodes", False):
-        raise ValueError("the agent of a policy that sees images reads features, which no policy gives it")
+    check_improvable(actor)
     read = [_as_key(key) for key in options["in_keys"]]
     if unknown := [key for key in read if key not in (actor.observation_key, *_READ)]:
         raise ValueError(
