@@ -107,7 +107,7 @@ def test_without_the_jacobian_it_is_lerobots(time):
 
 
 def gaussian_velocity(mean, mu, sigma):
-    """Return the velocity of data N(mean, 1) and a source N(mu, sigma^2), drawn independently of each other."""
+    """Return the velocity for data N(mean, 1) and an independent source N(mu, sigma^2)."""
 
     def velocity(t, a):
         t = t[:, None, None]

@@ -61,13 +61,20 @@ def mean_error(
         >>> mean_error(untrained, shared.windows(untrained.prior)).target  # the target itself
         0.0
     """
-    flat, target, rows, generator = inputs_and_targets(policy, windows)
-    with evaluation_mode(policy):
-        nfe = policy.sampling.evaluations(nfe)
-        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
+    flat, target, chunk = _predicted(policy, windows, nfe)
     mean = flat[keys.LOC]
     warm = (flat[keys.WARM] & flat["counted"]).expand_as(mean)
     return MeanError(_rms((mean - target)[warm]), _rms((mean - chunk)[warm]))
+
+
+def _predicted(
+    policy: WarmPriorActor, windows: TensorDictBase, nfe: int | None
+) -> tuple[TensorDictBase, Tensor, Tensor]:
+    """Return windows, targets and the policy's chunks, from draws of a fixed seed."""
+    flat, target, rows, generator = inputs_and_targets(policy, windows)
+    with evaluation_mode(policy):
+        noise = drawn(policy, rows, generator)
+        return flat, target, predict(policy, rows, noise, policy.sampling.evaluations(nfe))
 
 
 def error_by_position(
@@ -94,10 +101,7 @@ def error_by_position(
         >>> [len(errors) for errors in error_by_position(untrained, shared.windows(untrained.prior), nfe=1)]
         [4, 4]
     """
-    flat, target, rows, generator = inputs_and_targets(policy, windows)
-    with evaluation_mode(policy):
-        nfe = policy.sampling.evaluations(nfe)
-        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
+    flat, target, chunk = _predicted(policy, windows, nfe)
     counted = flat["counted"].squeeze(-1)
     executed = range(policy.prior.chunk_length)
     mean, prediction = (
