@@ -306,6 +306,14 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     file, theirs = (Task(open_demonstrations(p, task="lift")) for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity
+    chosen = {
+        episodes: Task(open_demonstrations(f"lerobot:{folder}", task="lift", episodes=list(episodes)))
+        for episodes in ((0,), (1,), (0, 1))
+    }
+    assert len({task.identity for task in chosen.values()}) == 3
+    assert chosen[0, 1].identity == theirs.identity  # all of them
+    first = Task(open_demonstrations(f"lerobot:{folder}", task="lift", demos=1))
+    assert first.identity == chosen[0,].identity  # the same steps, however they are asked for
     (folder / "meta" / "warmprior.json").unlink()  # as from another converter
     for actions, width in (("delta", 7), ("absolute", 10)):
         named = Task(open_demonstrations(f"lerobot:{folder}", task="lift"), actions=actions)
