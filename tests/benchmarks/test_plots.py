@@ -66,6 +66,8 @@ def test_learning_curves_show_every_checkpoint_and_every_loss(logged, tmp_path, 
         assert low < 50 and high > 100
     (line,) = figures[0][0].get_lines()  # a single point has no line
     assert (line.get_marker() == "") == (len(logged) > 1)
+    plots.plot_learning_curves(losses, rows[rows.checkpoint == 100], tmp_path / "b.png", "t")
+    assert [len(axes) for axes in figures] == [2, 1]  # one checkpoint is no curve
 
 
 def test_priors_of_ones_own_have_colours_of_their_own():

@@ -205,23 +205,28 @@ def plot_lines(
 def plot_learning_curves(
     losses: Mapping[str, Sequence[Sequence[tuple[int, float]]]], rows: DataFrame, path: str | Path, title: str
 ) -> None:
-    """Draw loss and success against iterations; `losses` has (iteration, loss) per method and seed."""
-    figure, (left, right) = new_figure(9.0, 3.6, columns=2)
-    left.sharex(right)
+    """Draw loss against iterations, and success if there are several checkpoints.
+
+    `losses` has (iteration, loss) per method and seed.
+    """
+    several = rows["checkpoint"].nunique() > 1
+    figure, (left, *others) = new_figure(9.0 if several else 5.0, 3.6, columns=1 + several)
     colors = colors_of(rows)
     for method, seeds in losses.items():
         for i, curve in enumerate(seeds):
             name = method if i == 0 else None
             look = {"color": colors[method], "lw": 1.0, "marker": "." if len(curve) == 1 else ""}
             left.plot(*zip(*curve, strict=True), label=name, **look)
-    for method, group in rows.groupby("method", sort=False):
-        rates = group.groupby("checkpoint")["success_rate"]
-        look = {"marker": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colors[method]}
-        right.errorbar(rates.mean().index, rates.mean(), yerr=rates.std().fillna(0.0), **look)
     left.set_yscale("log")
     dress(left, x="iteration", y="flow-matching loss (own source)")
-    nfes = ", ".join(map(str, rows["nfe"].unique()))  # a method may have its own
-    dress(right, x="iteration", y=f"success rate (NFE {nfes})", rate=True)
+    for right in others:
+        left.sharex(right)
+        for method, group in rows.groupby("method", sort=False):
+            rates = group.groupby("checkpoint")["success_rate"]
+            look = {"marker": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colors[method]}
+            right.errorbar(rates.mean().index, rates.mean(), yerr=rates.std().fillna(0.0), **look)
+        nfes = ", ".join(map(str, rows["nfe"].unique()))  # a method may have its own
+        dress(right, x="iteration", y=f"success rate (NFE {nfes})", rate=True)
     save(figure, path, title)
 
 
