@@ -20,14 +20,14 @@ def pytest_addoption(parser):
 LONG = [
     *("benchmarks/test_tasks.py", "benchmarks/test_studies.py", "benchmarks/test_policies.py"),
     *("rl/test_training.py", "envs/test_robosuite.py", "benchmarks/test_prior_space_rl.py"),
-    *("deploy/test_exported.py", "benchmarks/test_robomimic.py", "training/test_evaluation.py"),
+    *("deploy/test_exported.py", "benchmarks/test_robomimic.py", "evaluation/test_evaluation.py"),
 ]
 """Files of tens of seconds, which start first: begun last, one of them would keep a single core busy."""
 
 ALSO_OF_LEROBOT = [
     *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
+    *("tests/data/test_image_sizes.py", "tests/tasks/test_task.py", "tests/tasks/test_recording.py"),
     *("tests/benchmarks/test_joint_targets.py", "tests/benchmarks/test_paper_facts.py"),
-    "tests/training/test_task.py",
 ]
 
 
