@@ -2,6 +2,7 @@ import importlib.util
 from concurrent.futures import Future
 from functools import partial
 
+import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
@@ -30,15 +31,16 @@ class Inline:
         pass
 
 
-def sketch(figure, path, **options):
-    """To arrange what is drawn takes most of a chart's time."""
-    figure.set_layout_engine("none")
-    figure.canvas.print_figure(path, dpi=20)
+def blank(figure, path, **options):
+    """Write one white pixel: to arrange and draw takes nearly all of a chart's time."""
+    from matplotlib.image import imsave
+
+    imsave(path, np.full((1, 1, 3), 255, np.uint8))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def inline(request, short_episodes):
-    """Jobs are computed here, charts are sketched, and no video is made, unless a test asks for it.
+    """Jobs are computed here, charts are blank, and no video is made, unless a test asks for it.
 
     Flows are measured in few steps: what is looked at is what becomes of the numbers.
     """
@@ -61,7 +63,7 @@ def inline(request, short_episodes):
             measure = getattr(importlib.import_module(module), name)
             patch.setattr(place, partial(measure, n_steps=10))
         if request.path.name != "test_plots.py":  # there they are looked at
-            patch.setattr(Figure, "savefig", sketch)
+            patch.setattr(Figure, "savefig", blank)
         yield local
     for cached in (common.cached_task, common.prepared, common.simulator):
         cached.cache_clear()
