@@ -205,21 +205,17 @@ def main(argv: list[str] | None) -> None:
 
 
 def draw(rows: pd.DataFrame, path: Path, title: str, warmup_steps: int) -> None:
-    """Draw success of greedy and of stochastic agents against control steps (Fig. 7), the frozen policy at 0.
+    """Draw success of greedy agents against control steps (Fig. 7), the frozen policy at 0.
 
     Seeds are averaged evaluation by evaluation. Their numbers of control steps differ slightly, because an
     evaluation waits for the end of a decision; the mean is drawn.
     """
-    kinds = ("greedy", "stochastic")
-    parts = [rows[rows.evaluation.isin(["base", kind])].assign(panel=f"{kind} agent") for kind in kinds]
-    shown = pd.concat(parts)
-    shown["method"] = shown.algorithm.str.upper() + ", " + shown.method
-    agent = ["panel", "method"]
-    number = shown.groupby([*agent, "seed"]).cumcount()
-    same = shown.groupby([*agent, number])
+    shown = rows.assign(panel="greedy agent", method=rows.algorithm.str.upper() + ", " + rows.method)
+    number = shown.groupby(["method", "seed"]).cumcount()
+    same = shown.groupby(["method", number])
     shown["environment_steps"] = same["environment_steps"].transform("mean")
     # Evaluations that some seeds lack are left out.
-    shown = shown[same["seed"].transform("size") == shown.groupby(agent)["seed"].transform("nunique")]
+    shown = shown[same["seed"].transform("size") == shown.groupby("method")["seed"].transform("nunique")]
     lines = {"success_rate": f"success rate (learning starts at {warmup_steps:,} steps)"}
     plot_lines(shown, path, title, "environment_steps", lines, "panel", "linear")
 

@@ -251,11 +251,10 @@ for axis, (name, training) in zip(axes, trainings.items(), strict=True):
     curve = training.curve
     (base,) = [row for row in curve if row["evaluation"] == "base"]
     axis.axhline(base["success_rate"], color="0.4", ls="--", lw=1)
-    for kind, style in (("greedy", "o-"), ("stochastic", "s:")):
-        rows = [row for row in curve if row["evaluation"] == kind]
-        steps = [row["environment_steps"] for row in rows]
-        rates = [row["success_rate"] for row in rows]
-        axis.plot(steps, rates, style, color=color, ms=4, label=kind)
+    rows = [row for row in curve if row["evaluation"] == "greedy"]
+    steps = [row["environment_steps"] for row in rows]
+    rates = [row["success_rate"] for row in rows]
+    axis.plot(steps, rates, "o-", color=color, ms=4, label="greedy agent")
     axis.axvspan(0, config.warmup_steps, color="0.93")
     axis.set(title=name, xlabel="control steps", ylim=(-0.03, 1.05))
     axis.set_xlim(0, 7_200)

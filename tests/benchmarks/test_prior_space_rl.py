@@ -48,7 +48,7 @@ def test_the_toy_with_both_algorithms(toy, capsys):
     assert list(found) == [(seed, algorithm, "past") for seed in (0, 1) for algorithm in BOTH]
     for points in found.values():
         kinds = [point["evaluation"] for point in points]
-        assert kinds == ["base", "greedy", "stochastic", "greedy", "stochastic"]
+        assert kinds == ["base", "greedy", "greedy"]
         steps = [point["environment_steps"] for point in points]
         # All control steps, of at most 4 chunks of 8 actions beyond.
         assert steps[0] == 0 and 300 <= steps[1] < 332 and 500 <= steps[-1] < 532
@@ -80,19 +80,19 @@ def test_resume_goes_on_where_it_stopped(toy, tmp_path, monkeypatch):
 
     def interrupted(*args, **options):
         calls.append(None)
-        if len(calls) > 3:  # the frozen policy, and both agents after 300 steps
+        if len(calls) > 2:  # the frozen policy, and the agent after 300 steps
             raise KeyboardInterrupt
         return evaluate(*args, **options)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "evaluate", interrupted)
         benchmark.main(unit(tmp_path, seeds=1))
-    assert len(calls) == 4 and not (tmp_path / "results.jsonl").exists()
+    assert len(calls) == 3 and not (tmp_path / "results.jsonl").exists()
     with raises(ValueError, "--delta"):
         read(f"--resume --out {tmp_path} --delta 0.7")
     assert benchmark.main(["--resume", "--out", str(tmp_path)]) == 0
     rows = stored(tmp_path)
-    assert len(rows) == len(expected) == 5 and rows[:3] == expected[:3]
+    assert len(rows) == len(expected) == 3 and rows[:2] == expected[:2]
     assert rows[-1]["environment_steps"] >= 500
 
 

@@ -43,8 +43,8 @@ def test_the_best_agent_of_the_evaluations_is_the_policy(tmp_path, prior):
     training = make_training(tmp_path, actor=actor)
     kept, evaluated = {}, training._evaluate
 
-    def remembering(env, policies):
-        evaluated(env, policies)
+    def remembering(env, name, policy):
+        evaluated(env, name, policy)
         weights = {n: v.clone() for n, v in training.agent.network.state_dict().items()}
         kept[training.steps] = weights
 
@@ -71,7 +71,7 @@ def test_a_policy_is_improved_compared_and_saved(tmp_path):
     options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
     config = make_config(environment_steps=60)
     result = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
-    assert [row["evaluation"] for row in result.curve[:3]] == ["base", "greedy", "stochastic"]
+    assert [row["evaluation"] for row in result.curve[:3]] == ["base", "greedy", "greedy"]
     save_policy(result.policy, tmp_path / "policy")
     env = parallel_env(make_env, transforms, 2)
     for policy, solved in ((actor, result.before), (load_policy(tmp_path / "policy"), result.after)):

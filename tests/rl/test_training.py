@@ -90,11 +90,11 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
     assert training.buffer[:]["prior", "delta"].abs().max() <= delta
 
     kinds = [row["evaluation"] for row in curve]
-    assert kinds == ["base", *["greedy", "stochastic"] * 3]
+    assert kinds == ["base", *["greedy"] * 3]
     steps = [row["environment_steps"] for row in curve]
-    assert steps[0] == 0 and steps[1::2] == steps[2::2]
+    assert steps[0] == 0
     # At the first decision after every 30 control steps, of at most H in two environments.
-    assert all(30 * k <= step < 30 * k + 2 * H for k, step in enumerate(steps[1::2], 1))
+    assert all(30 * k <= step < 30 * k + 2 * H for k, step in enumerate(steps[1:], 1))
     for row in curve:
         assert row["episodes"] == 2 and row["success_rate"] == row["successes"] / 2
 

@@ -60,7 +60,7 @@ class PriorSpaceConfig:
         target_entropy: target of the entropy, in units of the box.
         reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
         evaluate_every: control steps between evaluations (and saves).
-        evaluation_episodes: episodes per evaluation, greedy and stochastic each.
+        evaluation_episodes: episodes per evaluation of the greedy agent.
         seed: seed of all random draws.
 
     Raises:

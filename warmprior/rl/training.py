@@ -128,7 +128,7 @@ class PriorSpaceTraining:
         >>> with TemporaryDirectory() as folder:
         ...     training = PriorSpaceTraining(actor, make_env, config, folder, evaluation_seed=100)
         ...     [row["evaluation"] for row in training.run()]
-        ['base', 'greedy', 'stochastic']
+        ['base', 'greedy']
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class PriorSpaceTraining:
 
         Returns:
             The evaluations, each with ``environment_steps``, ``evaluation`` (``"base"`` for the frozen policy
-            itself, ``"greedy"`` or ``"stochastic"``), ``episodes``, ``successes`` and ``success_rate``.
+            itself, or ``"greedy"``), ``episodes``, ``successes`` and ``success_rate``.
 
         Raises:
             KeyError: if the environment has no anchor.
@@ -221,7 +221,7 @@ class PriorSpaceTraining:
                     "leave gamma out of policy_transforms"
                 )
             if not self.curve:
-                self._evaluate(evaluation_env, {"base": self.actor})
+                self._evaluate(evaluation_env, "base", self.actor)
                 self._save()
             while self.steps < config.environment_steps:
                 self._switch.learning.fill_(self.steps >= config.warmup_steps)
@@ -235,8 +235,7 @@ class PriorSpaceTraining:
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises if the agent's state is not finite.
-                    policy = self.agent.policy
-                    self._evaluate(evaluation_env, {"greedy": policy, "stochastic": policy})
+                    self._evaluate(evaluation_env, "greedy", self.agent.policy)
                     self._save()
 
     @contextmanager
@@ -315,30 +314,23 @@ class PriorSpaceTraining:
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]
         return [*states, keys.DELTA, keys.CHUNK, *(unravel_key(("next", key)) for key in after)]
 
-    def _evaluate(self, env: EnvBase, policies: dict[str, TensorDictModuleBase]) -> None:
-        for name, policy in policies.items():
-            kind = ExplorationType.DETERMINISTIC if name == "greedy" else ExplorationType.RANDOM
-            with set_exploration_type(kind):
-                episodes = evaluate(
-                    policy,
-                    env,
-                    episodes=self.config.evaluation_episodes,
-                    first_seed=self.evaluation_seed,
-                    nfe=self.config.nfe if name == "base" else None,
-                    policy_seed=self.config.seed,
-                )
-            successes = sum(episode.success for episode in episodes)
-            row = {
-                "environment_steps": self.steps,
-                "evaluation": name,
-                "episodes": len(episodes),
-                "successes": successes,
-                "success_rate": successes / len(episodes),
-            }
-            rates = [r["success_rate"] for r in self.curve if r["evaluation"] != "stochastic"]
-            if name == "greedy" and successes / len(episodes) > max(rates):
-                self._best = {n: v.detach().clone() for n, v in self.agent.network.state_dict().items()}
-            self.curve.append(row)
+    def _evaluate(self, env: EnvBase, name: str, policy: TensorDictModuleBase) -> None:
+        kind = ExplorationType.DETERMINISTIC if name == "greedy" else ExplorationType.RANDOM
+        with set_exploration_type(kind):
+            episodes = evaluate(
+                policy,
+                env,
+                episodes=self.config.evaluation_episodes,
+                first_seed=self.evaluation_seed,
+                nfe=self.config.nfe if name == "base" else None,
+                policy_seed=self.config.seed,
+            )
+        successes = sum(episode.success for episode in episodes)
+        rate = successes / len(episodes)
+        if self.curve and rate > max(row["success_rate"] for row in self.curve):
+            self._best = {n: v.detach().clone() for n, v in self.agent.network.state_dict().items()}
+        row = {"environment_steps": self.steps, "evaluation": name, "episodes": len(episodes)}
+        self.curve.append(row | {"successes": successes, "success_rate": rate})
         self.agent.policy.train()
 
     def policy(self) -> WarmPriorActor:

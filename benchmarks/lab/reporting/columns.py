@@ -29,7 +29,7 @@ _COMPARED: dict[str, tuple[str, str]] = {
     "centre": ("", "centre of the agent's box: the mean of the source, or zero"),
     "delta": ("g", "half the side of the agent's box"),
     "environment_steps": ("d", "control steps that the agent has collected"),
-    "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy, stochastic: the agent"),
+    "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy: the agent"),
     "mean": ("", "history of the source: training (the data's), or deployed (from the policy's prediction)"),
 }
 
