@@ -181,7 +181,8 @@ def reading(what: str, advice: str) -> Iterator[None]:
     except (DatasetError, MemoryError):
         raise
     except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
-        raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
+        reason = str(error) or repr(error)  # an assertion has no words
+        raise DatasetError(f"{what} cannot be read ({reason}). {advice}") from error
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:
