@@ -169,12 +169,15 @@ def test_counts_that_differ(root, form, counted):
 
 
 @pytest.mark.parametrize("form", ["hdf5", "parquet"])
-@pytest.mark.parametrize("count", [2, 4, 10**10, "3"])
+@pytest.mark.parametrize("count", [2, 4, 10**10, "x"])
 def test_episodes_that_metadata_do_not_count(root, form, count):
     name = written(data_format=form, success=form == "hdf5")
     (metadata,) = root.glob("toy/walk/human-v0/data/metadata.json")
     change(metadata, total_episodes=count)
     with raises(DatasetError, metadata.parent, "metadata.json", count):
+        MinariDemonstrations(name).index()
+    change(metadata, total_episodes=len(LENGTHS), total_steps=str(count))
+    with raises(DatasetError, metadata.parent, count):
         MinariDemonstrations(name).index()
 
 

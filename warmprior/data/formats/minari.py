@@ -179,7 +179,7 @@ class MinariDemonstrations(Demonstrations):
         self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
     ) -> DatasetIndex:
         dataset = load_minari(self.place)
-        where = Path(dataset.spec.data_path)
+        where = Path(dataset.storage.data_path)
         if self.mask is not None or poses:
             what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
             raise DatasetError(f"{where}: a Minari dataset has no {what}: leave the option out")
@@ -201,14 +201,15 @@ class MinariDemonstrations(Demonstrations):
                     raise unknown_name_error(where, kind, key, present)
         check_count(where, self.demos, dataset.total_episodes)
         episodes = [int(i) for i in dataset.episode_indices][: self.demos]
+        whole = self.demos in (None, dataset.total_episodes)
         with reading(f"{where}: its episodes", _AGAIN):
             steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
+            counted = dataset.total_steps if whole else sum(steps)
         if not steps or min(steps) < 1:
             raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
-        whole = self.demos in (None, dataset.total_episodes)
-        if whole and sum(steps) != dataset.total_steps:
-            counted = f"metadata.json counts {dataset.total_steps} steps, but the episodes {sum(steps)}"
-            raise DatasetError(f"{where}: {counted}. {_AGAIN}")
+        if counted != sum(steps):
+            differs = f"metadata.json counts {counted} steps, but the episodes {sum(steps)}"
+            raise DatasetError(f"{where}: {differs}. {_AGAIN}")
         return DatasetIndex(
             path=where,
             demos=tuple(map(str, episodes)),
