@@ -191,12 +191,12 @@ def _says_so(read: RobomimicDemonstrations, data: TensorDictBase, actions: str) 
             np.concatenate([file[f"data/{demo}/obs/{key}"][()] for key in index.observation_keys], -1)
             for demo in demos
         ]
-        actions = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
+        deltas = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
         meta = json.loads(file["data"].attrs["env_args"])
         rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
     pairs = [(data["observation"], np.concatenate(values)), (data["next", "reward"][:, 0], rewards)]
     if actions == "delta":
-        pairs.append((data["action"], actions))
+        pairs.append((data["action"], deltas))
     equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
     return equal and index.env_args == meta
 
