@@ -11,6 +11,9 @@ import torch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
+LARGEST = 1e9
+"""The largest number in any unit: a larger one is damage, which squashes all others or overflows."""
+
 
 def given(**values: Any) -> dict[str, Any]:
     """Return the arguments that are not ``None``, which neither checks nor torch.compile take."""
@@ -18,14 +21,14 @@ def given(**values: Any) -> dict[str, Any]:
 
 
 def check_finite_numbers(**values: Any) -> None:
-    """Raise ValueError for the first value that is not a finite number."""
+    """Raise ValueError for the first value that is not a number up to 1e9, positive or negative."""
     for name, value in values.items():
         try:
-            finite = not isinstance(value, bool) and math.isfinite(value)
+            finite = not isinstance(value, bool) and math.isfinite(value) and abs(value) <= LARGEST
         except (TypeError, ValueError, OverflowError):
             finite = False
         if not finite:
-            raise ValueError(f"{name} must be a finite number, got {value!r}")
+            raise ValueError(f"{name} must be a finite number up to {LARGEST:g}, got {value!r}")
 
 
 def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
@@ -60,6 +63,12 @@ def check_share(**values: Any) -> None:
 def check_between(low: float, high: float, /, **values: Any) -> None:
     """Raise ValueError for the first value that is not a number in the interval, ends included."""
     _check_range(values, lambda value: low <= value <= high, f"between {low} and {high}")
+
+
+def all_usable(values: Tensor) -> bool:
+    """Return True unless a tensor holds NaN, infinity, or a number above 1e9."""
+    # As Python's numbers, since the bound is infinite in half precision; False for NaN.
+    return not values.numel() or all(-LARGEST <= end.item() <= LARGEST for end in values.aminmax())
 
 
 def is_true(key: NestedKey, value: Any) -> bool:

@@ -111,6 +111,11 @@ META = {
     "v2.1": (v21, ["v2.1", "convert_dataset_v21_to_v30"]),
     **{name: (change, ["meta/info.json", f"{name}="]) for name, change in MALFORMED.items()},
     **{f"at {text}": (info_of("data_path", text), ["data_path="]) for text in TEMPLATES},
+    "no place": (info_of("data_path", None), ["data_path=None"]),
+    "no place of a video": (
+        info(lambda i: i.update(video_path=None) or i["features"]["observation.state"].update(dtype="video")),
+        ["video_path=None"],
+    ),
     "data of a camera": (info_of("data_path", "{video_key}/{chunk_index}"), ["data_path="]),
     "a number of a camera": (info_of("video_path", "{video_key:03d}"), ["video_path="]),
     "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),

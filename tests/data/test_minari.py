@@ -1,10 +1,16 @@
 """Datasets of Minari against Minari's own reader, and their environments."""
 
+import json
+import os
+from itertools import product
+
 import gymnasium
+import h5py
 import numpy as np
 import pytest
 import torch
 
+from tests.data.hdf5_faults import FAULTS, replace
 from tests.errors import raises
 
 minari = pytest.importorskip("minari")
@@ -13,7 +19,7 @@ from gymnasium.spaces import Box, Dict, Discrete  # noqa: E402
 from minari import create_dataset_from_buffers  # noqa: E402
 from minari.data_collector import EpisodeBuffer  # noqa: E402
 
-from warmprior import PastPrior  # noqa: E402
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor  # noqa: E402
 from warmprior.__main__ import main  # noqa: E402
 from warmprior.data import DatasetError, open_demonstrations  # noqa: E402
 from warmprior.data.formats.minari import MinariDemonstrations  # noqa: E402
@@ -121,6 +127,85 @@ def test_what_there_is_not(root):
     data.write_bytes(data.read_bytes()[:900])
     with raises(DatasetError, "walk/human-v0"):
         MinariDemonstrations(name).steps()
+
+
+NOT_A_FLAG = {"terminations": lambda file, name, folder: replace(file, name, np.full(LENGTHS[1], np.nan))}
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        *product(("actions", "observations/arm", "rewards"), sorted(FAULTS.keys() - {"all with many rows"})),
+        *product(("terminations",), ("never written", "a row less", "terminations")),
+        *product(("infos/success",), ("external link", "never written")),
+    ],
+)
+def test_no_dataset_is_read_that_holds(root, tmp_path, fault, name):
+    dataset = written(observation=TREE)
+    (path,) = root.rglob("main_data.hdf5")
+    with h5py.File(path, "a") as file:
+        (FAULTS | NOT_A_FLAG)[fault](file, f"episode_1/{name}", tmp_path)
+    others = {"link to a link": "elsewhere", "group": "episode 1", "empty": "episode 1"}
+    with raises(DatasetError, "walk/human-v0", others.get(fault, name.split("/")[-1])):
+        MinariDemonstrations(dataset).steps()
+
+
+@pytest.mark.parametrize("form", ["hdf5", "parquet"])
+@pytest.mark.parametrize("counted", [{"episode": 5}, {"episode": 5, "total_steps": 17}, {"total_steps": 23}])
+def test_counts_that_differ(root, form, counted):
+    name, where = written(data_format=form, success=form == "hdf5"), root / "toy/walk/human-v0/data"
+    assert MinariDemonstrations(name).index().lengths == LENGTHS
+    for key, value in counted.items():
+        if key != "episode":
+            change(where / "metadata.json", **{key: value})
+        elif form == "hdf5":
+            with h5py.File(where / "main_data.hdf5", "a") as file:
+                file["episode_1"].attrs["total_steps"] = value
+        else:
+            change(where / "1/metadata.json", total_steps=value)
+    facts = ["total_steps", 5, 12] if len(counted) > 1 else ["metadata.json", *counted.values()][:1]
+    with raises(DatasetError, where, *facts):
+        MinariDemonstrations(name).steps()
+
+
+@pytest.mark.parametrize("form", ["hdf5", "parquet"])
+@pytest.mark.parametrize("count", [2, 4, 10**10, "x"])
+def test_episodes_that_metadata_do_not_count(root, form, count):
+    name = written(data_format=form, success=form == "hdf5")
+    (metadata,) = root.glob("toy/walk/human-v0/data/metadata.json")
+    change(metadata, total_episodes=count)
+    with raises(DatasetError, metadata.parent, "metadata.json", count):
+        MinariDemonstrations(name).index()
+    change(metadata, total_episodes=len(LENGTHS), total_steps=str(count))
+    with raises(DatasetError, metadata.parent, count):
+        MinariDemonstrations(name).index()
+
+
+def change(path, **entries):
+    path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+
+@pytest.mark.parametrize("file", ["main_data.hdf5", "metadata.json"])
+def test_a_pipe_is_not_waited_for(root, file):
+    name = written()
+    (path,) = root.glob(f"toy/walk/human-v0/data/{file}")
+    path.unlink()
+    os.mkfifo(path)
+    with raises(DatasetError, path, "not a regular file"):
+        MinariDemonstrations(name).index()
+
+
+def test_an_environment_that_does_not_take_what_was_recorded(root):
+    """As of another version of its package."""
+    name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
+    (metadata,) = root.glob("toy/walk/human-v0/data/metadata.json")
+    spec = json.loads(json.loads(metadata.read_text())["env_spec"])
+    change(metadata, env_spec=json.dumps(spec | {"kwargs": {"friction": 0.5}}))
+    task = Task(open_demonstrations(f"minari:{name}"))
+    with raises(ValueError, f"minari:{name}", "Pendulum-v1", "{'friction': 0.5}", "make_env"):
+        task.make_env()
+    with raises(ValueError, "Pendulum-v1", "{'friction': 0.5}", "make_env"):
+        environment_of(WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4), environment=task.environment))
 
 
 def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Files to damage, and the ways to do so: demonstrations, policies, training states and results."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,10 +14,15 @@ from tensordict import TensorDict, TensorDictBase
 
 pytest.importorskip("robosuite")
 pytest.importorskip("pyarrow")
+pytest.importorskip("lerobot_policy_warmprior")
+pytest.importorskip("minari")
 
 import h5py
+import minari
 import numpy as np
 import pyarrow.parquet as parquet
+from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
+from minari.data_collector import EpisodeBuffer
 
 from lab.options.options import Options, with_parts
 from lab.options.presets import PRESETS
@@ -26,6 +32,7 @@ from tests.data.hdf5_faults import FAULTS, NUMBERS, replace
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.sandbox import Outcome
 from tests.lab.reporting.test_rows import ROW
+from tests.lerobot.plugin_policies import flow_policy, one_observation
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, training
 from warmprior import (
@@ -39,6 +46,7 @@ from warmprior import (
 from warmprior.data import convert_robomimic
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.minari import MinariDemonstrations
 from warmprior.history import cold_history
 from warmprior.saving.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.saving.policies import load_policy, policy_config, save_policy
@@ -183,12 +191,12 @@ def _says_so(read: RobomimicDemonstrations, data: TensorDictBase, actions: str) 
             np.concatenate([file[f"data/{demo}/obs/{key}"][()] for key in index.observation_keys], -1)
             for demo in demos
         ]
-        actions = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
+        deltas = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
         meta = json.loads(file["data"].attrs["env_args"])
         rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
     pairs = [(data["observation"], np.concatenate(values)), (data["next", "reward"][:, 0], rewards)]
     if actions == "delta":
-        pairs.append((data["action"], actions))
+        pairs.append((data["action"], deltas))
     equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
     return equal and index.env_args == meta
 
@@ -351,7 +359,7 @@ def mutate_policies(folder: Path, rng: np.random.Generator) -> Case:
 def _odd_tensor(tensors: dict[str, torch.Tensor], rng: np.random.Generator) -> str:
     """Replace a value, or a tensor, in place; returns how."""
     name = str(rng.choice(sorted(tensors)))
-    value = float(rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 10.0]))
+    value = float(rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 10.0, 1e30]))
     if rng.random() < 0.3:
         tensors[name] = tensors[name].flatten()[:-1].clone()
         return f"{name} cut"
@@ -402,6 +410,130 @@ class Subject:
     mutate: Callable[[Path, np.random.Generator], Case]
 
 
+MINARI = "toy/walk/human-v0"
+
+
+def make_minari(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    for place, form in (("whole", "hdf5"), ("tables", "parquet")):
+        os.environ["MINARI_DATASETS_PATH"] = str(folder / place)
+        buffers = [
+            EpisodeBuffer(
+                id=i,
+                observations=rng.uniform(-1, 1, (n + 1, 3)).astype(np.float32),
+                actions=rng.uniform(-1, 1, (n, 1)).astype(np.float32),
+                rewards=rng.uniform(size=n).tolist(),
+                terminations=[False] * n,
+                truncations=[False] * (n - 1) + [True],
+            )
+            for i, n in enumerate((7, 12))
+        ]
+        minari.create_dataset_from_buffers(MINARI, buffers, env="Pendulum-v1", data_format=form)
+
+
+def mutate_minari(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage a file of a dataset: its bytes, an entry of its JSON, or an array of HDF5."""
+    whole, case = folder / str(rng.choice(["whole", "whole", "tables"])), folder / "case"
+    shutil.rmtree(case, ignore_errors=True)
+    shutil.copytree(whole, case)
+    must_refuse = False
+    if whole.name == "whole" and rng.random() < 0.4:
+        fault = str(rng.choice(sorted(FAULTS.keys() - {"all with many rows"})))
+        name = f"episode_{rng.choice(2)}/{rng.choice(['actions', 'rewards', 'observations'])}"
+        how, must_refuse = f"{fault} {name}", True
+        with h5py.File(case / MINARI / "data/main_data.hdf5", "a") as file:
+            FAULTS[fault](file, name, folder)
+    else:
+        files = sorted(p for p in (case / MINARI / "data").rglob("*") if p.is_file())
+        path = files[int(rng.integers(len(files)))]
+        inside = path.parent.name == "data" and path.suffix == ".json" and rng.random() < 0.6
+        how = f"{path.name} {_odd_text(path, rng) if inside else damage_content(path, rng)}"
+
+    def read(place: Path) -> tuple[TensorDictBase, dict[str, Any]]:
+        os.environ["MINARI_DATASETS_PATH"] = str(place)
+        demonstrations = MinariDemonstrations(MINARI)
+        return demonstrations.steps(), demonstrations.environment(demonstrations.index())
+
+    def load() -> Outcome:
+        (data, environment), (expected, recorded) = read(case), read(whole)
+        if must_refuse:
+            return Outcome("silent", "was read")
+        equal = data.shape == expected.shape and bool((data == expected).all())
+        if equal and environment == recorded:
+            return Outcome("equal")
+        # Neither plain HDF5, parquet nor JSON keeps a checksum: then any reader finds the same.
+        ok = _minari_says_so(case, data, environment)
+        return Outcome("as stored") if ok else Outcome("silent", "differs")
+
+    return how, load, str(case)
+
+
+def _odd_text(path: Path, rng: np.random.Generator) -> str:
+    """Change an entry of the JSON that is a text in Minari's metadata; returns where."""
+    content = json.loads(path.read_text())
+    name = str(rng.choice(["env_spec", "observation_space", "action_space"]))
+    inner = json.loads(content[name])
+    how = odd_json(inner, rng)
+    path.write_text(json.dumps(content | {name: json.dumps(inner)}))
+    return f"{name}: {how}"
+
+
+def _minari_says_so(folder: Path, data: TensorDictBase, environment: dict[str, Any]) -> bool:
+    """Whether Minari alone reads the same."""
+    os.environ["MINARI_DATASETS_PATH"] = str(folder)
+    dataset = minari.load_dataset(MINARI)
+    episodes = list(dataset.iterate_episodes())
+    pairs = [
+        (data["observation"], [episode.observations[:-1] for episode in episodes]),
+        (data["action"], [episode.actions for episode in episodes]),
+        (data["next", "reward"][:, 0], [episode.rewards for episode in episodes]),
+    ]
+    equal = all(torch.equal(mine, torch.from_numpy(np.concatenate(own)).float()) for mine, own in pairs)
+    spec = dataset.env_spec
+    if spec is None:
+        return equal and not environment
+    described = environment["gymnasium"]
+    return equal and all(
+        described[name] == getattr(spec, name) for name in ("id", "kwargs", "max_episode_steps")
+    )
+
+
+def make_plugin(folder: Path) -> None:
+    flow_policy({"warm_flow": WarmFlowPolicy}).save_pretrained(folder / "whole")
+
+
+def mutate_plugin(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage the configuration of a policy of LeRobot's, or the header of its weights."""
+    whole, case = folder / "whole", folder / "case"
+    shutil.rmtree(case, ignore_errors=True)
+    shutil.copytree(whole, case)
+    weights = case / "model.safetensors"
+    of_weights = bool(rng.random() < 0.3)
+    if of_weights:
+        content = bytearray(weights.read_bytes())
+        header = 8 + int.from_bytes(content[:8], "little")
+        for place in rng.integers(header, size=int(rng.integers(1, 9))):
+            content[place] ^= 1 << int(rng.integers(8))
+        weights.write_bytes(content)
+        how = "header flipped"
+    else:
+        how = f"config.json {damage_content(case / 'config.json', rng)}"
+
+    def load() -> Outcome:
+        policy, expected = WarmFlowPolicy.from_pretrained(case), WarmFlowPolicy.from_pretrained(whole)
+        if not same(policy.state_dict(), expected.state_dict()):
+            return Outcome("silent", "the weights differ")
+        if policy.config == expected.config:
+            return Outcome("equal")
+        # Another option of the same network; nothing signs a configuration of LeRobot.
+        torch.manual_seed(0)
+        action = policy.select_action(one_observation())
+        good = not of_weights and action.shape == (2, 2) and bool(action.isfinite().all())
+        return Outcome("as stored") if good else Outcome("silent", f"{action.shape}, or not finite")
+
+    return how, load, str(case)
+
+
 SUBJECTS = (
     Subject("demonstration files", make_demonstrations, mutate_demonstrations),
     Subject("saved policies", make_policies, mutate_policies),
@@ -409,4 +541,6 @@ SUBJECTS = (
     Subject("results", make_rows, mutate_rows),
     Subject("options", make_options, mutate_options),
     Subject("LeRobotDatasets", make_datasets, mutate_datasets),
+    Subject("Minari's datasets", make_minari, mutate_minari),
+    Subject("LeRobot's policies", make_plugin, mutate_plugin),
 )

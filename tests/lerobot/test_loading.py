@@ -1,6 +1,7 @@
 import json
 import resource
 import sys
+from itertools import product
 
 import pytest
 import torch
@@ -29,6 +30,9 @@ def edit(folder, change):
     save_file(weights, folder / "model.safetensors")
 
 
+BIAS = "actor.ode.network.network.head.1.bias"
+
+
 def misfit(folder, how):
     """Spoil the weights; return what the error has to name."""
     one = max(load_file(folder / "model.safetensors"))
@@ -41,13 +45,24 @@ def misfit(folder, how):
     if how == "missing":
         edit(folder, lambda weights: weights.pop(one))
         return one
+    if how in ("1e30", "NaN"):
+        edit(folder, lambda weights: weights[BIAS].view(-1)[-1:].fill_(float(how)))
+        return BIAS
+    if how == "whole numbers":
+        edit(folder, lambda weights: weights.update({BIAS: weights[BIAS].int()}))
+        return BIAS
     name, size = (one, 99) if how == "shape" else ("more.weight", 3)
     edit(folder, lambda weights: weights.update({name: torch.zeros(size)}))
     return name
 
 
-@pytest.mark.parametrize("how", ["absent", "foreign", "missing", "shape", "unexpected"])
-@pytest.mark.parametrize("name", NAMES)
+MISFITS = ["absent", "foreign", "missing", "shape", "unexpected"]
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [*product(NAMES, MISFITS), *(("warm_flow", how) for how in ("1e30", "NaN", "whole numbers"))],
+)
 def test_weights_that_do_not_fit_are_refused_by_name(found, name, how, tmp_path):
     made(found, name).save_pretrained(tmp_path)
     load(found, name, tmp_path)
@@ -63,6 +78,21 @@ def test_damaged_weights_are_named(found, tmp_path):
     content[0] ^= 0xFF  # the length of the header
     file.write_bytes(content)
     with raises(ValueError, file, "damaged"):
+        load(found, "warm_flow", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        *(("input_features", None), ("prior", None), ("prior", "past,sigma=1e30"), ("nfe", 0), ("nfe", [])),
+        ("output_features", {"action": {"type": "ACTION", "shape": [10**30]}}),
+    ],
+)
+def test_a_configuration_of_which_nothing_can_be_built(found, tmp_path, option, value):
+    made(found, "warm_flow").save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {option: value}))
+    with raises(ValueError, tmp_path, "cannot be built"):
         load(found, "warm_flow", tmp_path)
 
 

@@ -1,3 +1,5 @@
+import json
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -108,6 +110,16 @@ def test_a_dataset_without_statistics_is_refused(found, tmp_path):
     (tmp_path / "data/meta/stats.json").unlink()
     with raises(ValueError, "meta/stats.json", "action: min, action: max"):
         dataset_policy(found, tmp_path / "data", precondition=False)
+
+
+def test_nan_of_an_episode_that_is_left_out_is_in_the_statistics(found, tmp_path):
+    root = tmp_path / "data"
+    write_lerobot(root, (12, 12))
+    stats = json.loads((root / "meta/stats.json").read_text())
+    stats["action"]["max"][0] = float("nan")  # as LeRobot writes it
+    (root / "meta/stats.json").write_text(json.dumps(stats))
+    with raises(ValueError, "meta/stats.json", "action: max", "delete_episodes", "recompute_stats"):
+        dataset_policy(found, root, [0])
 
 
 def test_features_of_width_1(found, tmp_path):

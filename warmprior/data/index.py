@@ -13,14 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice, check_distinct, check_positive, check_whole_numbers, given
+from warmprior.checks import (
+    LARGEST,
+    check_choice,
+    check_distinct,
+    check_positive,
+    check_whole_numbers,
+    given,
+)
 from warmprior.envs.env_args import declared_actions
 from warmprior.envs.tasks import TaskSpec
 from warmprior.modules.resize import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
 MISFIT = "They do not fit these actions: correct one or the other."
-LARGEST = 1e9  # in any unit; a larger value is damage, and would squash all others of its feature
 
 
 class DatasetError(ValueError):
@@ -175,7 +181,8 @@ def reading(what: str, advice: str) -> Iterator[None]:
     except (DatasetError, MemoryError):
         raise
     except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
-        raise DatasetError(f"{what} cannot be read ({error}). {advice}") from error
+        reason = str(error) or repr(error)  # an assertion has no words
+        raise DatasetError(f"{what} cannot be read ({reason}). {advice}") from error
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:

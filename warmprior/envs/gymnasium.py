@@ -24,7 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from warmprior.checks import check_distinct, is_true
+from warmprior.checks import check_distinct, given, is_true
 from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
@@ -173,14 +173,15 @@ def registered_env(
     Args:
         description: ``"id"`` and ``"kwargs"`` of ``gymnasium.make``, ``"max_episode_steps"``, and
             ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is written under
-            ``"success"``.
+            ``"success"``; in data also the ``"dataset"``, for errors.
         terminate_on_success: see :func:`gym_env`.
         horizon: steps per episode, instead of ``"max_episode_steps"``.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
 
     Raises:
         ImportError: if no environment with this name is registered.
-        ValueError: if the description has wrappers, which would be imported.
+        ValueError: if the description has wrappers, which would be imported, or the environment cannot be
+            built as it says.
 
     Examples:
         >>> from warmprior.envs import registered_env
@@ -204,12 +205,21 @@ def registered_env(
         )
     if render_mode is not None and (backend := rendering_backend()) is not None:
         os.environ["MUJOCO_GL"] = backend  # environments of MuJoCo would first try to open a window
-    kwargs = {key: value for key, value in description.get("kwargs", {}).items() if key != "render_mode"}
-    env = gymnasium.make(
-        name,
-        max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
-        **kwargs | ({} if render_mode is None else {"render_mode": render_mode}),
-    )
+    kwargs, rendered = description.get("kwargs") or {}, given(render_mode=render_mode)
+    try:
+        env = gymnasium.make(
+            name,
+            max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
+            **{key: value for key, value in kwargs.items() if key != "render_mode"} | rendered,
+        )
+    except ImportError:
+        raise
+    except Exception as error:  # the environment's own, of any class
+        raise ValueError(
+            f"{description.get('dataset', 'the policy')} was recorded in {name} with kwargs={kwargs}, which "
+            f"is not built here ({error}): install the version of its package that takes them, or give a "
+            "make_env of your own"
+        ) from error
     if env.spec.max_episode_steps is None:
         warnings.warn(f"{name} has no time limit: episodes may never end without a horizon", stacklevel=2)
     success = description.get("success")

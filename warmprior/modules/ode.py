@@ -197,8 +197,10 @@ class Sampling:
         _jump(self.grid)  # raises at an unknown grid
         if isinstance(self.clip, Sequence):
             object.__setattr__(self, "clip", tuple(self.clip))
-            if not (self.clip and all(bound >= 0 for bound in self.clip)):
-                raise ValueError(f"clip must be a bound >= 0 per action dimension, got {self.clip}")
+            if not self.clip:
+                raise ValueError("clip must be a bound >= 0 per action dimension, got none")
+            for bound in self.clip:
+                check_not_negative(clip=bound)
         else:
             check_positive(**given(clip=self.clip))
         check_not_negative(**given(temperature=self.temperature))

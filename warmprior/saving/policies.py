@@ -17,12 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from warmprior.checks import check_device
+from warmprior.checks import LARGEST, all_usable, check_device
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, is_repository, read_json, write_atomic
-from warmprior.modules.actor import StartPoint, WarmPriorActor
+from warmprior.modules.actor import USUAL_KEYS, StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork, precision_of, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.ode import Sampling
 from warmprior.modules.preconditioning import SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
@@ -309,12 +310,12 @@ def load_policy(
         actor = _filled(config, tensors)
     except Exception as error:  # options of another version can raise anything
         reason = str(error) if type(error) is ValueError else repr(error)
-        raise ValueError(f"the policy at {folder} cannot be built here: {reason}") from error
+        raise ValueError(f"the policy in {folder / WEIGHTS} cannot be built here: {reason}") from error
     return actor.to(device).eval()
 
 
 def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorActor:
-    """Return the actor of a configuration, with these weights, all of which must be finite."""
+    """Return the actor of a configuration, with these weights, all of which must be usable numbers."""
     with NoLargerThan(tensors):
         actor = _from_config(config)
     built = actor.state_dict()
@@ -324,8 +325,9 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
         expected, stored = (f"{tuple(t.shape)} of {t.dtype}" for t in (value, tensors[name]))
         if stored != expected:
             raise ValueError(f"{name} is {stored}, not {expected}")
-        if value.is_floating_point() and not torch.isfinite(tensors[name]).all():
-            raise ValueError(f"{name} holds NaN or infinity")
+        # Data have no larger numbers, so no training makes them; their products overflow at decisions.
+        if value.is_floating_point() and not all_usable(tensors[name]):
+            raise ValueError(f"{name} holds NaN, infinity or numbers above {LARGEST:g}")
     actor.load_state_dict(tensors)
     for place, module in actor.named_modules():
         if isinstance(module, (Normalizer, RestingAction, SourceMoments)):
@@ -361,6 +363,9 @@ class NoLargerThan(TorchDispatchMode):
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     """Return the actor of a configuration, with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
+    # The constructor also takes objects, which no file holds.
+    if others := options.keys() - {*asdict(Sampling()), *USUAL_KEYS, "observation_key", "guidance"}:
+        raise ValueError(f"actor.{min(others)} is no option of a saved policy")
     for name, value in options.items():
         if name.endswith("_key"):
             options[name] = as_key(value)

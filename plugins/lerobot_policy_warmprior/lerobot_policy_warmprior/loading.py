@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
+from draccus.utils import DraccusException
 from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError
 from lerobot.configs.policies import PreTrainedConfig
@@ -16,6 +17,7 @@ from lerobot.configs.types import NormalizationMode
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from warmprior.checks import LARGEST, all_usable
 from warmprior.io.files import read_json
 from warmprior.saving.policies import NoLargerThan
 
@@ -73,18 +75,24 @@ def saved_json(place: str, name: str, **hub: Any) -> dict[str, Any]:
 
 
 def check_statistics(config: Any, meta: Any) -> None:
-    """Raise ValueError for a dataset without the statistics that the policy's normalisation needs."""
-    features, missing = {**config.input_features, **config.output_features}, []
+    """Raise ValueError for a dataset without usable statistics that the policy's normalisation needs."""
+    features, unusable = {**config.input_features, **config.output_features}, []
     for name, feature in features.items():
         mode = config.normalization_mapping.get(feature.type.value, NormalizationMode.IDENTITY)
         stats = (meta.stats or {}).get(name, {})
-        missing += [f"{name}: {n}" for n in STATISTICS.get(mode, ()) if n not in stats]
-    if missing:
+        numbers = {n: torch.as_tensor(stats.get(n, torch.nan)) for n in STATISTICS.get(mode, ())}
+        unusable += [f"{name}: {n}" for n, value in numbers.items() if not all_usable(value)]
+    if unusable:
         raise ValueError(
-            f"{meta.root}/meta/stats.json lacks {', '.join(missing)}: LeRobot would train on raw values. "
-            "Compute it (lerobot-edit-dataset --operation.type=recompute_stats), or change "
-            "--policy.normalization_mapping"
+            f"{meta.root}/meta/stats.json has no usable {', '.join(unusable)}: LeRobot would train on raw "
+            "values, or on NaN, which any episode brings there. Delete such episodes (lerobot-edit-dataset "
+            "--operation.type=delete_episodes), compute it again (--operation.type=recompute_stats), or "
+            "change --policy.normalization_mapping"
         )
+
+
+UNBUILT = (ValueError, TypeError, AttributeError, ArithmeticError, LookupError, AssertionError)
+"""What options raise that no policy can be built of."""
 
 
 class WholePolicy(nn.Module):
@@ -99,12 +107,17 @@ class WholePolicy(nn.Module):
         """Load weights, and note those that do not fit."""
         weights = self.state_dict()
         loaded = {weights[name].data_ptr() for name in weights.keys() & state_dict.keys()}
+        found = [(name, value) for name, value in weights.items() if name in state_dict]
         wrong = {
             # A file has tied weights once.
             "missing": [n for n, v in weights.items() if n not in state_dict and v.data_ptr() not in loaded],
             "unexpected": [n for n in state_dict if n not in weights and not OLD_BUFFERS.match(n)],
-            "of another shape": [
-                n for n, v in weights.items() if n in state_dict and v.shape != state_dict[n].shape
+            "of another shape": [n for n, v in found if v.shape != state_dict[n].shape],
+            "of another type": [
+                n for n, v in found if v.is_floating_point() != state_dict[n].is_floating_point()
+            ],
+            f"with NaN, infinity or numbers above {LARGEST:g}": [
+                n for n, v in found if self.has_all_weights and not all_usable(state_dict[n])
             ],
         }
         problems = [
@@ -135,15 +148,15 @@ class WholePolicy(nn.Module):
         hub = {name: kwargs[name] for name in HUB if name in kwargs}
         weights = saved_weights(place, **hub)
         saved = saved_json(place, "config.json", **hub)
-        if config is None:
-            config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
-        if saved.get("type") == cls.name:
-            kept = PreTrainedConfig.from_pretrained(place, **hub)
-            if getattr(config, "joints", None) == "auto":  # what the weights were trained with
-                config.joints = kept.joints
-            check_options(place, kept, config, training=kwargs.get("dataset_meta") is not None)
         misfit: str | None
         try:
+            if config is None:
+                config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
+            if saved.get("type") == cls.name:
+                kept = PreTrainedConfig.from_pretrained(place, **hub)
+                if getattr(config, "joints", None) == "auto":  # what the weights were trained with
+                    config.joints = kept.joints
+                check_options(kept, config, training=kwargs.get("dataset_meta") is not None)
             # A training that goes on reads its dataset while the policy is built.
             limited = cls.has_all_weights and weights and kwargs.get("dataset_meta") is None
             with NoLargerThan(weights) if limited else nullcontext():
@@ -155,8 +168,11 @@ class WholePolicy(nn.Module):
             misfit = str(error)  # it names the weights
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{place} has no policy: {error}") from error
-        except ValueError as error:
-            raise ValueError(f"the policy in {place} cannot be built: {error}") from error
+        except (*UNBUILT, DraccusException) as error:
+            if any(repr(name) in str(error) for name in kwargs):  # an argument of the caller's
+                raise
+            reason = str(error).partition("\n")[0] or repr(error)
+            raise ValueError(f"the policy in {place} cannot be built: {reason}") from error
         if misfit == WholePolicy._misfit:
             raise FileNotFoundError(f"{place} has no model.safetensors: choose the folder of a saved policy")
         if misfit:
@@ -167,12 +183,12 @@ class WholePolicy(nn.Module):
         return policy
 
 
-def check_options(place: str, saved: Any, requested: Any, *, training: bool) -> None:
+def check_options(saved: Any, requested: Any, *, training: bool) -> None:
     """Raise ValueError if options contradict those that a saved policy was trained with."""
     before, now = (config.meaning(training=training) for config in (saved, requested))
     changes = [f"{name}={now[name]!r} (it has {before[name]!r})" for name in now if now[name] != before[name]]
     if changes:
-        raise ValueError(f"{place} was trained with other options than {', '.join(changes)}: leave them out")
+        raise ValueError(f"it was trained with other options than {', '.join(changes)}: leave them out")
 
 
 def check_known(name: str, arguments: Mapping[str, Any], names: Sequence[str]) -> None:

@@ -63,7 +63,7 @@ def names(group: h5py.Group) -> list[str]:
 
 
 def member(
-    parent: h5py.Group, name: str, kind: Literal["group", "dataset"]
+    parent: h5py.Group, name: str, kind: Literal["group", "dataset"] | None = None
 ) -> h5py.Group | h5py.Dataset | None:
     """Open a group or dataset below ``parent`` that is fully stored in this file; ``None`` without one."""
     with reading(parent, name):
@@ -71,11 +71,19 @@ def member(
         if item is None:
             return None
         actual = "group" if isinstance(item, require("h5py", "sim").Group) else "dataset"
-        if actual != kind:
+        if kind not in (None, actual):
             raise DatasetError(f"{_place(parent, name)} is a {actual}, not a {kind}; rebuild the file")
-        if kind == "dataset":
+        if actual == "dataset":
             _check_stored(item)
         return item
+
+
+def check_members(parent: h5py.Group, name: str) -> None:
+    """Raise DatasetError unless what is below ``parent`` is fully stored in this file, with all it holds."""
+    with reading(parent, name):  # a group that holds itself ends in a RecursionError
+        item = member(parent, name)
+        for inner in names(item) if isinstance(item, require("h5py", "sim").Group) else ():
+            check_members(item, inner)
 
 
 def _place(parent: h5py.Group, name: str = "") -> str:
@@ -147,8 +155,8 @@ _IMAGE_BYTES = 2**24  # bytes of images that are read at once
 
 
 @contextmanager
-def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
-    """Open a robomimic file for reading; raise DatasetError if it is incomplete or has no demos."""
+def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
+    """Open a file for reading; raise DatasetError if it is none of HDF5's."""
     h5py = require("h5py", "sim")
     path = Path(path)
     if path.is_dir():
@@ -168,6 +176,13 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
         size = path.stat().st_size
         raise DatasetError(f"{path}: not a readable HDF5 file ({size} bytes; {error}). {_AGAIN}") from error
     with file:
+        yield file
+
+
+@contextmanager
+def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
+    """Open a robomimic file for reading; raise DatasetError if it is incomplete or has no demos."""
+    with open_hdf5(path) as file:
         data = member(file, "data", "group")
         if data is None:
             raise DatasetError(f"{path}: no group 'data' among {names(file)}: not a robomimic file")

@@ -177,8 +177,10 @@ def _check_info(info: Any) -> str:
         for part, kinds in {"names": (list, dict), "info": (dict,), "video_info": (dict,)}.items():
             value = feature.get(part)
             need(f"features.{name}.{part}", value, value is None or isinstance(value, kinds))
-    for name in ("data_path", "video_path"):
-        if (path := info.get(name)) is not None:  # LeRobot's own by default
+    videos = any(feature["dtype"] == "video" for feature in features.values())
+    for name, used in {"data_path": True, "video_path": videos}.items():
+        path = info.get(name)
+        if path is not None or (used and name in info):  # LeRobot's own by default
             good = isinstance(path, str) and _TEMPLATE.fullmatch(path) is not None
             need(name, path, good and (name == "video_path" or "{video_key}" not in path))
     return version

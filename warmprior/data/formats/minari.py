@@ -1,4 +1,7 @@
-"""Minari's demonstrations: datasets in the Farama Foundation's format, read by its own package."""
+"""Minari's demonstrations: datasets in the Farama Foundation's format, read by its own package.
+
+That believes every file, follows links out of it, and waits for pipes; :mod:`.hdf5` has the checks.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from warmprior.checks import check_shape
 from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.hdf5 import check_members, member, names, open_hdf5
 from warmprior.data.index import (
     DatasetError,
     DatasetIndex,
@@ -24,7 +29,7 @@ from warmprior.data.index import (
     unknown_name_error,
 )
 from warmprior.io.extras import require
-from warmprior.io.files import digest_of, file_digest
+from warmprior.io.files import check_regular, digest_of, file_digest, read_json
 
 _AGAIN = "Download it again."
 
@@ -40,18 +45,34 @@ def load_minari(name: str | Path) -> Any:
         DatasetError: if the dataset is damaged.
     """
     minari = require("minari", "minari")
+    folder = Path(minari.storage.get_dataset_path(name)) / "data"
     try:
-        return minari.load_dataset(name, download=True)
+        if not folder.exists():
+            minari.download_dataset(name)
     except Exception as error:
-        folder = Path(minari.storage.get_dataset_path(name))
-        if (folder / "data").exists():
-            raise DatasetError(
-                f"{folder}: not a readable Minari dataset ({error}): download it again"
-            ) from error
         raise FileNotFoundError(
             f"minari:{name}: no such dataset at {folder} ({error}): `minari list remote` shows public "
             "datasets, and MINARI_DATASETS_PATH is the folder of local ones"
         ) from error
+    with reading(f"{folder}: the Minari dataset", _AGAIN):
+        _check_files(folder)
+        return minari.load_dataset(name)
+
+
+def _check_files(folder: Path) -> None:
+    """Raise an error for files that cannot be opened, and if the metadata count other episodes."""
+    for path in folder.rglob("*"):
+        if not path.is_dir():
+            check_regular(path)
+    episodes = [path.name for path in folder.iterdir() if path.is_dir()]
+    if (data := folder / "main_data.hdf5").exists():
+        with open_hdf5(data) as file:
+            episodes = names(file)
+            for episode in episodes:
+                member(file, episode, "group")
+    count = read_json(folder / "metadata.json")["total_episodes"]
+    if count != len(episodes):
+        raise DatasetError(f"{folder}: metadata.json counts {count} episodes, not {len(episodes)}. {_AGAIN}")
 
 
 def _spaces(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -76,23 +97,35 @@ def _is_picture(space: Any) -> bool:
 class MinariReader(DemonstrationReader):
     """A reader of a dataset's values."""
 
-    def __init__(self, name: str | Path, path: Path) -> None:
-        self._dataset, self._path = load_minari(name), path
-        self._episode = lru_cache(maxsize=1)(self._read)  # arrays of one episode are read one after another
+    def __init__(self, name: str | Path, index: DatasetIndex) -> None:
+        self._dataset, self._path = load_minari(name), index.path
+        self._shapes = dict(zip(index.image_keys, index.image_shapes, strict=True))
+        self._steps = dict(zip(index.demos, index.lengths, strict=True))
+        self.episode = lru_cache(maxsize=1)(self._read)  # arrays of one episode are read one after another
 
     def _read(self, demo: str) -> Any:
         with reading(f"{self._path}: episode {demo}", _AGAIN):
+            if (data := self._path / "main_data.hdf5").exists():
+                with open_hdf5(data) as file:
+                    check_members(file, f"episode_{demo}")
             return next(self._dataset.iterate_episodes([int(demo)]))
 
     def _values(self, demo: str, key: str) -> np.ndarray:
-        episode = self._episode(demo)
-        if not key.startswith("obs/"):
-            return np.asarray(getattr(episode, key))
-        observations = episode.observations
-        if isinstance(observations, Mapping):
-            for part in key.removeprefix("obs/").split("/"):
-                observations = observations[part]
-        return np.asarray(observations)[:-1]  # the last one follows the last action
+        """Return an array of an episode, which has a row of numbers for each of its steps."""
+        episode, steps = self.episode(demo), self._steps[demo]
+        with reading(self.name(demo, key), _AGAIN):
+            if key.startswith("obs/"):
+                observations = episode.observations
+                if isinstance(observations, Mapping):
+                    for part in key.removeprefix("obs/").split("/"):
+                        observations = observations[part]
+                values = np.asarray(observations)[:-1]  # the last one follows the last action
+            else:
+                values = np.asarray(getattr(episode, key))
+            if values.dtype.kind not in "fiub" or len(values) != steps:
+                rows = f"{len(values)} rows of {values.dtype}"
+                raise ValueError(f"{rows}, but total_steps counts {steps} steps with numbers")
+        return values
 
     @override
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
@@ -106,11 +139,16 @@ class MinariReader(DemonstrationReader):
 
     @override
     def terminated(self, demo: str) -> bool | None:
-        return bool(self._values(demo, "terminations")[-1])
+        last = np.empty((1, 1))
+        self.numbers(demo, "terminations", last, self._steps[demo] - 1)
+        return bool(last)
 
     @override
     def images(self, demo: str, key: str) -> Iterator[Tensor]:
-        yield torch.from_numpy(self._values(demo, f"obs/{key}")).permute(0, 3, 1, 2)
+        images = self._values(demo, f"obs/{key}")
+        with reading(self.name(demo, key), _AGAIN):
+            check_shape("an image", images[0], (*self._shapes[key], 3))
+        yield torch.from_numpy(images).permute(0, 3, 1, 2)
 
     @override
     def name(self, demo: str, key: str) -> str:
@@ -141,7 +179,7 @@ class MinariDemonstrations(Demonstrations):
         self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
     ) -> DatasetIndex:
         dataset = load_minari(self.place)
-        where = Path(dataset.spec.data_path)
+        where = Path(dataset.storage.data_path)
         if self.mask is not None or poses:
             what = "masks" if poses is False else "poses of a gripper, from which absolute actions are made"
             raise DatasetError(f"{where}: a Minari dataset has no {what}: leave the option out")
@@ -163,10 +201,15 @@ class MinariDemonstrations(Demonstrations):
                     raise unknown_name_error(where, kind, key, present)
         check_count(where, self.demos, dataset.total_episodes)
         episodes = [int(i) for i in dataset.episode_indices][: self.demos]
+        whole = self.demos in (None, dataset.total_episodes)
         with reading(f"{where}: its episodes", _AGAIN):
             steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
+            counted = dataset.total_steps if whole else sum(steps)
         if not steps or min(steps) < 1:
             raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
+        if counted != sum(steps):
+            differs = f"metadata.json counts {counted} steps, but the episodes {sum(steps)}"
+            raise DatasetError(f"{where}: {differs}. {_AGAIN}")
         return DatasetIndex(
             path=where,
             demos=tuple(map(str, episodes)),
@@ -177,13 +220,13 @@ class MinariDemonstrations(Demonstrations):
             available_keys=tuple(spaces),
             taken_by={key: "images" if key in pictures else "" for key in spaces if key not in vectors},
             action_dim=action.shape[0],
-            whole=self.demos in (None, dataset.total_episodes),
+            whole=whole,
         )
 
     @contextmanager
     @override
     def reader(self, index: DatasetIndex) -> Iterator[MinariReader]:
-        yield MinariReader(self.place, index.path)
+        yield MinariReader(self.place, index)
 
     @override
     def contents(self, index: DatasetIndex) -> str:
@@ -195,13 +238,13 @@ class MinariDemonstrations(Demonstrations):
         spec = dataset.env_spec
         if spec is None:
             return {}
-        with reading(f"{dataset.spec.data_path}: the first episode", _AGAIN):
-            infos = next(dataset.iterate_episodes()).infos or {}
+        infos = MinariReader(self.place, index).episode(index.demos[0]).infos or {}
         described = {
             "id": spec.id,
-            "kwargs": dict(spec.kwargs or {}),
+            "kwargs": spec.kwargs,
             "wrappers": [wrapper.name for wrapper in spec.additional_wrappers or ()],
             "max_episode_steps": spec.max_episode_steps,
             "success": next((key for key in SUCCESS_NAMES if key in infos), None),
+            "dataset": str(self),
         }
         return {"gymnasium": described}
