@@ -56,7 +56,13 @@ def load_minari(name: str | Path) -> Any:
         ) from error
     with reading(f"{folder}: the Minari dataset", _AGAIN):
         _check_files(folder)
-        return minari.load_dataset(name)
+        return _parsed(name, folder, (folder / "metadata.json").read_bytes())
+
+
+@lru_cache(maxsize=2)
+def _parsed(name: str | Path, folder: Path, metadata: bytes) -> Any:
+    """Return the dataset of these metadata: to parse the bounds of every pixel takes seconds."""
+    return require("minari", "minari").load_dataset(name)
 
 
 def _check_files(folder: Path) -> None:
