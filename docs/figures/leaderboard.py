@@ -231,7 +231,8 @@ def tables() -> dict[Path, list[str]]:
     return {
         PAGE: [short_table(HUMAN), short_table(SCRIPTED)],
         DOCS / "notes" / "leaderboard.md": [table(HUMAN), one_seed_table(), table(SCRIPTED)],
-        DOCS / "paper.md": [effect_table(), paper_table()],
+        DOCS / "paper.md": [effect_table()],
+        DOCS / "notes" / "paper_readings.md": [paper_table()],
     }
 
 

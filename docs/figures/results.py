@@ -222,10 +222,7 @@ def paper_table() -> str:
 
 
 def tables() -> dict[Path, list[str]]:
-    """Return the tables of each page in their order; the lab notes have those of runs alone.
-
-    The first table of paper.md is the leaderboard's, which has the human sets.
-    """
+    """Return the tables of each page in their order; the lab notes have those of runs alone."""
     return {
         PAGE: [table(), sets_table()],
         DOCS / "notes" / "evidence.md": [lengths_table()],
