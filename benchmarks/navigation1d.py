@@ -24,8 +24,8 @@ from lab.reporting.report import labelled, table, unlike, write_report
 from lab.running.comparison import train_all
 from lab.running.policies import policies_of, trained_actors, write_rows
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
+from warmprior.options.training import PAPER
 from warmprior.training import NetworkOptions, TrainingConfig
-from warmprior.training.options import PAPER
 
 JUDGED = [  # columns of the table
     *("switch_rate", "commit_rate", "collision_rate", "route_entropy", "distance", "jump_ratio"),

@@ -48,8 +48,8 @@ from warmprior.data import open_demonstrations
 from warmprior.deploy import export_policy, load_exported
 from warmprior.envs import RobosuiteEnv
 from warmprior.io.distributed import joined, rank
+from warmprior.options.training import PAPER
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
-from warmprior.training.options import PAPER
 
 BATCH = 256
 

@@ -34,7 +34,7 @@ from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
 from warmprior.envs.tasks import TASKS
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
-from warmprior.training import NetworkOptions, TrainingConfig
+from warmprior.training import NetworkOptions, TrainingConfig, make_network
 from warmprior.training.optim import ema_of, make_optimizer
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
@@ -79,7 +79,7 @@ def optimized(optimizer):
 
 def recipe(options):
     """The rows of Table 3, from what the options build."""
-    network, training = options.network.make(7, 9, 8), options.training
+    network, training = make_network(options.network, 7, 9, 8), options.training
     (dropout,) = {module.p for module in network.modules() if isinstance(module, nn.Dropout)}
     rates = values(training, ("learning_rate", "weight_decay"))
     found = {
@@ -105,7 +105,9 @@ def evaluation(options, **others):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_recipe_from_the_state(name, monkeypatch):
     preset, usual = presets_of(name, monkeypatch)["paper"], facts.EVALUATION
-    assert isinstance(preset.network.make(7, 9, 8), ChiTransformer) and not preset.network.precondition
+    assert (
+        isinstance(make_network(preset.network, 7, 9, 8), ChiTransformer) and not preset.network.precondition
+    )
     assert recipe(preset) == STATE
     # Two studies have one NFE, and one has all chunk lengths.
     own = {name: {"nfe": usual["nfe"]} for name in ("sigma", "real_time_chunking")}
@@ -165,13 +167,13 @@ def test_the_preset_of_the_public_code_from_images(monkeypatch):
         assert presets["much-ado"].data.actions == "delta"
     read = parse(PRESETS, argv, "robomimic", None)
     assert with_parts(read, run=vars(adapted["much-ado"].run)) == adapted["much-ado"]
-    network = read.network.make(7, 9, 8, {"agentview_image": 84})
+    network = make_network(read.network, 7, 9, 8, {"agentview_image": 84})
     observation_layers = network.network.observation_layers
     assert (observation_layers, network.encoder.backbone) == (2, "resnet18")
 
 
 def test_what_the_preset_of_the_public_code_builds():
-    network = PRESETS["much-ado"].network.make(10, 9, 8)
+    network = make_network(PRESETS["much-ado"].network, 10, 9, 8)
     angles = network.embed_time[0].frequencies
     assert (angles.max().item(), angles.min().item()) == (
         1.0,
@@ -198,7 +200,7 @@ def test_defaults_of_the_library():
 
 def test_the_images_network_has_group_norm():
     pytest.importorskip("torchvision")
-    encoder = NetworkOptions("plain_mlp", encoder="resnet18").make(7, 9, 8, {"camera": 84}).encoder
+    encoder = make_network(NetworkOptions("plain_mlp", encoder="resnet18"), 7, 9, 8, {"camera": 84}).encoder
     kinds = {type(module) for module in encoder.modules() if "Norm" in type(module).__name__}
     assert kinds == {nn.GroupNorm} and encoder.backbone == "resnet18"
 
@@ -302,7 +304,7 @@ def test_the_study_without_chunks(monkeypatch):
 def test_the_toy(monkeypatch):
     presets, toy = presets_of("navigation1d", monkeypatch), facts.TOY
     preset = presets["paper"]
-    network = preset.network.make(1, facts.TOY_OBSERVATION_DIM, 4)
+    network = make_network(preset.network, 1, facts.TOY_OBSERVATION_DIM, 4)
     layers = [module for module in network.modules() if isinstance(module, nn.Linear)]
     assert isinstance(network, PlainMLP) and len(layers) == toy["layers"]
     widths = {layer.out_features for layer in layers[:-1]}

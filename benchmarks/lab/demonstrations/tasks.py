@@ -29,11 +29,10 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
 from warmprior.modules.encoder import imagenet_weights
-from warmprior.modules.resize import IMAGE_SIZE, Resizing
+from warmprior.options.data import IMAGE_SIZE, Actions, Resizing
+from warmprior.options.training import OF_IMAGES, PRETRAINED
 from warmprior.tasks import Play, Task
 from warmprior.training import NetworkOptions
-from warmprior.training.options import OF_IMAGES, PRETRAINED
-from warmprior.transforms.absolute_actions import Actions
 
 GENERATED = 150
 """Default number of scripted demonstrations."""

@@ -24,10 +24,10 @@ from lab.demonstrations.tasks import (
 )
 from lab.methods.methods import Method
 from warmprior.data import open_demonstrations
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import check_batch, launched
 from warmprior.modules.ode import Sampling
-from warmprior.training import NetworkOptions, TrainingConfig
+from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.training import NetworkOptions, TrainingConfig, make_network
 
 STARTS = 10_000
 """The number of simulator seeds that each training seed has for its evaluation episodes."""
@@ -176,7 +176,7 @@ class Options:
         check_batch(self.training.batch_size)
         try:
             with torch.device("meta"):  # nothing is computed
-                without_images(self.network).make(1, 1, 2)
+                make_network(without_images(self.network), 1, 1, 2)
         except ValueError as error:
             raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):

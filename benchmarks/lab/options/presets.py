@@ -7,8 +7,8 @@ from typing import Any
 from lab.demonstrations.tasks import DataOptions, is_simulated
 from lab.options.options import Evaluation, Options, with_parts
 from warmprior.modules import imagenet_weights
+from warmprior.options.training import PAPER, PRETRAINED
 from warmprior.training import NetworkOptions, TrainingConfig
-from warmprior.training.options import PAPER, PRETRAINED
 
 PRESETS: dict[str, Options] = {
     # A first table: one seed, a small network and a short training, in a setting where the source matters.
