@@ -10,6 +10,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+OF_TORCH = ("peers", "throughput")
+"""Scripts that measure PyTorch, and import it before they read their options."""
+
+SCRIPTS = [path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem not in OF_TORCH]
+OF_DEMONSTRATIONS = ["generate", "download", "render"]
 COMMANDS = ["info", "push", "evaluate", "train", "improve", "export", "convert", "observe"]
 HELP = """
 import contextlib, importlib, io, json, sys
@@ -36,6 +41,7 @@ json.dump(texts, sys.stdout)
 def helps():
     """The help of every command, printed by one process that cannot import PyTorch."""
     commands = [["warmprior.__main__"], *(["warmprior.__main__", name] for name in COMMANDS)]
+    commands += [*([name] for name in SCRIPTS), *(["demonstrations", name] for name in OF_DEMONSTRATIONS)]
     place = os.pathsep.join(map(str, (ROOT, ROOT / "benchmarks")))
     environment = {**os.environ, "PYTHONPATH": place, "COLUMNS": "80"}
     command = [sys.executable, "-c", HELP, json.dumps(commands)]
@@ -58,6 +64,9 @@ def groups(text):
 def test_what_everyone_sets_comes_first(helps):
     order = ["", "data", "source", "training", "evaluation", "run", "network"]
     assert groups(helps["warmprior.__main__ train"]) == order
+    order[2] = "sources"
+    for name in ("robomimic", "pusht", "joint_targets", "mimicgen_tasks", "chunking", "navigation1d"):
+        assert groups(helps[name]) == order, name
 
 
 def test_a_reader_who_has_seen_enough_is_no_error():

@@ -226,6 +226,7 @@ def improve(
         revision: branch, tag or commit of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
+    from warmprior.rl.agent import delta_of
     from warmprior.rl.improve import SMALL, improve_policy
     from warmprior.saving.policies import save_policy
 
@@ -242,7 +243,7 @@ def improve(
         seed=seed,
     )
     print(
-        f"{algorithm} around a box of +-{config.delta_for(actor):g}: {steps:,} control steps, the first "
+        f"{algorithm} around a box of +-{delta_of(config, actor):g}: {steps:,} control steps, the first "
         f"{warmup:,} without an agent; {config.updates} updates per step of {num_envs} simulators, discount "
         f"{config.gamma:g} per chunk, NFE {config.nfe}",
         flush=True,

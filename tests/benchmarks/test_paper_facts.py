@@ -34,6 +34,7 @@ from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
 from warmprior.envs.tasks import TASKS
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
+from warmprior.rl.agent import delta_of
 from warmprior.training import NetworkOptions, TrainingConfig, make_network
 from warmprior.training.optim import ema_of, make_optimizer
 
@@ -126,7 +127,7 @@ def test_the_recipe_from_images(monkeypatch):
     assert recipe(with_parts(paper, data={"obs": "image"})) == IMAGE
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
-    monkeypatch.setattr("lab.options.presets.imagenet_weights", lambda: None)  # nothing is downloaded
+    monkeypatch.setattr("warmprior.modules.encoder.imagenet_weights", lambda: None)  # nothing is downloaded
     asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
@@ -156,7 +157,7 @@ def test_the_preset_of_the_public_code_from_the_state(name, monkeypatch):
 
 def test_the_preset_of_the_public_code_from_images(monkeypatch):
     pytest.importorskip("torchvision")
-    monkeypatch.setattr("lab.demonstrations.tasks.require_rendering", lambda: None)
+    monkeypatch.setattr("warmprior.envs.rendering.require_rendering", lambda: None)
     argv = ["--preset", "much-ado", "--obs", "image", "--out", "out"]
     adapted = {
         name: with_parts(with_parts(PRESETS[name], **IMAGES[name]), data={"obs": "image"})
@@ -332,7 +333,7 @@ def test_the_agents():
         prior = kind(2)
         actor = WarmPriorActor(VelocityMLP(1, 1, prior.prediction_length, hidden_dim=8), prior)
         expected = facts.BOX_AROUND_ZERO if name == "gaussian" else facts.BOX_AROUND_MEAN
-        assert PriorSpaceConfig().delta_for(actor) == expected
+        assert delta_of(PriorSpaceConfig(), actor) == expected
     assert presets["unit"].delta == (facts.BOX_AROUND_MEAN, facts.BOX_AROUND_ZERO)
 
 

@@ -16,7 +16,7 @@ from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.rl.agent import PriorSpaceConfig
+from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
