@@ -33,6 +33,12 @@ for module, *argv in json.loads(sys.argv[1]):
         except SystemExit as stop:
             assert not stop.code, (module, stop.code)
     texts[" ".join([module, *argv])] = said.getvalue()
+with contextlib.redirect_stderr(io.StringIO()) as said:
+    try:
+        importlib.import_module("card").main(["a run", "a folder"])
+    except ImportError as error:
+        said.write(str(error))
+texts["start"] = said.getvalue()
 json.dump(texts, sys.stdout)
 """
 
@@ -51,9 +57,15 @@ def helps():
 
 
 def test_help_names_options_and_no_none(helps):
-    assert not [name for name, text in helps.items() if "usage: " not in text]
+    assert [name for name, text in helps.items() if "usage: " not in text] == ["start"]
     found = {name: re.findall(r".*\bNone\b.*|.*\(default: \).*", text) for name, text in helps.items()}
     assert not {name: lines for name, lines in found.items() if lines}
+
+
+def test_what_takes_seconds_is_said_before_it_begins(helps):
+    """All scripts read their options by the same function."""
+    assert helps["start"].splitlines()[0] == "importing PyTorch"
+    assert "torch is imported" in helps["start"]
 
 
 def groups(text):

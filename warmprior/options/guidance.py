@@ -23,6 +23,11 @@ class GuidanceOptions:
             takes 0.6 of the time, but is no longer exact in the Gaussian case.
         sigma: the source's standard deviation in the weight; by default that of the policy's source. 1 gives
             the published weight.
+
+    Examples:
+        >>> from warmprior.options.guidance import GuidanceOptions
+        >>> GuidanceOptions(schedule="linear").max_guidance_weight
+        5.0
     """
 
     horizon: int | None = None
