@@ -12,19 +12,15 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from lab.demonstrations.tasks import check_counts, title_of
+from lab.demonstrations.data_options import check_counts
 from lab.options.command_line import parse, script, started
 from lab.options.options import MeasuredOptions, check_given, check_single
 from lab.options.presets import PRESETS, study
-from lab.reporting.plots import plot_lines
-from lab.reporting.report import labelled, per_seed, table, write_report
-from lab.reporting.rows import PLAYED, read_rows
-from lab.running.comparison import compare
-from lab.running.measuring import held_out
-from lab.running.policies import policies_of, write_rows
-from warmprior.diagnostics import action_error, encoded_windows
-from warmprior.training import TrainingConfig
+
+if TYPE_CHECKING:
+    from warmprior.options.training import TrainingConfig
 
 
 @dataclass(frozen=True)
@@ -50,6 +46,15 @@ def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and number of iterations."""
     presets = {name: study(BudgetOptions, base, observations=1_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "budget", __doc__)
+    from lab.demonstrations.tasks import title_of
+    from lab.reporting.plots import plot_lines
+    from lab.reporting.report import labelled, per_seed, table, write_report
+    from lab.reporting.rows import PLAYED, read_rows
+    from lab.running.comparison import compare
+    from lab.running.measuring import held_out
+    from lab.running.policies import policies_of, write_rows
+    from warmprior.diagnostics import action_error, encoded_windows
+
     with started(options, "budget") as out:
         policies = policies_of(options)
         # Before the training, so that data that cannot be measured on cost no hours.

@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 
 from lab.options.command_line import script
-from lab.reporting.cards import measured
-from lab.reporting.report import policy_results
-from warmprior.saving import load_policy, model_card
+from warmprior.io.script import read_command_line
 
 
 @script("card.py", hint="")
@@ -26,7 +24,11 @@ def main(argv: list[str] | None) -> None:
         "--repository", default="user/name", help="hub repository that the card names (default: %(default)s)"
     )
     parser.add_argument("--license", help="licence of the policy in the hub's spelling, such as mit")
-    args = parser.parse_args(argv)
+    args = read_command_line(lambda: parser.parse_args(argv))
+    from lab.reporting.cards import measured
+    from lab.reporting.report import policy_results
+    from warmprior.saving import load_policy, model_card
+
     results = measured(policy_results(args.run, args.folder))
     actor = load_policy(args.folder)
     print(model_card(actor, **results, repository=args.repository, license=args.license))

@@ -14,11 +14,6 @@ import sys
 from lab.options.command_line import parse, script, started
 from lab.options.options import check_single, with_parts
 from lab.options.presets import PRESETS
-from lab.reporting.paper import PAPER_CHUNK
-from lab.reporting.plots import plot_bars, plot_lines, plot_success
-from lab.reporting.report import at_fewest, counted, labelled, per_seed, table, write_report
-from lab.running.comparison import compare
-from lab.running.policies import policies_of, slug
 
 JUMPS = ("boundary_jump", "inner_jump")
 
@@ -29,6 +24,12 @@ def main(argv: list[str] | None) -> None:
     chunks = {"sources": {"chunk": (1, 2, 4, 8, 16)}}
     presets = {name: with_parts(preset, **chunks) for name, preset in PRESETS.items()}
     options = parse(presets, argv, "chunking", __doc__)
+    from lab.reporting.paper import PAPER_CHUNK
+    from lab.reporting.plots import plot_bars, plot_lines, plot_success
+    from lab.reporting.report import at_fewest, counted, labelled, per_seed, table, write_report
+    from lab.running.comparison import compare
+    from lab.running.policies import policies_of, slug
+
     check_single(options, "sigma", "temperature")
     with started(options, "chunking") as out:
         policies = policies_of(options)

@@ -9,19 +9,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-import torch
-
-from lab.measures.straightness import RATIOS, check_flows, straightness
 from lab.options.command_line import parse, script, started
 from lab.options.options import FinishedRun, MeasuredOptions
 from lab.options.presets import PRESETS, study
-from lab.reporting.paper import paper_curvature
-from lab.reporting.plots import plot_flow_paths
-from lab.reporting.report import counted, labelled, pooled, setting_title, table, write_report
-from lab.running.comparison import train_all
-from lab.running.measuring import held_out
-from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
-from warmprior.diagnostics import encoded_windows, flow_paths
 
 
 @dataclass(frozen=True)
@@ -40,6 +30,17 @@ def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
     presets = {name: study(CurvatureOptions, base, observations=2_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "curvature", __doc__)
+    import torch
+
+    from lab.measures.straightness import RATIOS, check_flows, straightness
+    from lab.reporting.paper import paper_curvature
+    from lab.reporting.plots import plot_flow_paths
+    from lab.reporting.report import counted, labelled, pooled, setting_title, table, write_report
+    from lab.running.comparison import train_all
+    from lab.running.measuring import held_out
+    from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
+    from warmprior.diagnostics import encoded_windows, flow_paths
+
     check_flows(options.sources.methods())
     with started(options, "curvature") as out:
         run = options.policies

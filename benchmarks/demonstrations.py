@@ -11,11 +11,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from lab.demonstrations.downloads import OFFICIAL, download_robomimic
-from lab.demonstrations.render import render_demonstrations
-from lab.demonstrations.scripted.generate import generate_demonstrations
+from lab.demonstrations.downloads import OFFICIAL
 from lab.demonstrations.scripted.tasks import EXPERTS
 from lab.options.command_line import script
+from warmprior.io.script import read_command_line
 
 
 @script("demonstrations.py", hint="")
@@ -47,7 +46,11 @@ def main(argv: list[str] | None) -> None:
     add("--out", type=Path, help="HDF5 file to write, which may be FILE itself (default: in the cache)")
     add("--workers", type=int, help="number of processes (default: one per core)")
 
-    args = parser.parse_args(argv)
+    args = read_command_line(lambda: parser.parse_args(argv))
+    from lab.demonstrations.downloads import download_robomimic
+    from lab.demonstrations.render import render_demonstrations
+    from lab.demonstrations.scripted.generate import generate_demonstrations
+
     if args.command == "generate":
         print(generate_demonstrations(args.task, args.style, args.n, path=args.out, overwrite=args.overwrite))
     elif args.command == "download":

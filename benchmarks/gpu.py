@@ -19,24 +19,23 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-import throughput
 from tqdm import tqdm
 
-from lab.demonstrations.tasks import check_counts
+from lab.demonstrations.data_options import check_counts
 from lab.io.files import ERRORS, PartialFailure, read_lines
 from lab.io.machine import check_device, facts_of_machine
-from lab.measures.timing import Clock
 from lab.options.command_line import read, script
 from lab.options.options import Options, check_given, with_parts
 from lab.options.presets import PRESETS, adapted
-from lab.running.comparison import EPISODES_PER_JOB, train_all
-from lab.running.jobs import Jobs
-from lab.running.policies import Cell, Policy, play, policies_of, row
 from warmprior.checks import check_choice, check_positive
 from warmprior.io.files import check_writable, write_atomic
+
+if TYPE_CHECKING:
+    from lab.measures.timing import Clock
+    from lab.running.policies import Cell, Policy
 
 ROOT = Path(__file__).parents[1]
 PROBE, TINY_PROBE = 300, 6
@@ -87,6 +86,8 @@ class GpuOptions:
 
     def policies(self, obs: str, iterations: int = 1, first: bool = False) -> tuple[Options, list[Policy]]:
         """Return the preset's policies for a number of iterations; encoders start from random weights."""
+        from lab.running.policies import policies_of
+
         changes: dict[str, dict[str, Any]] = {
             "data": {"obs": obs, "demonstrations": (DEMONSTRATIONS[obs],)},
             "network": {"encoder": "resnet18"},
@@ -130,23 +131,31 @@ def tests(o: GpuOptions, seconds: float) -> dict[str, Any]:
 
 
 def clock(o: GpuOptions) -> Clock:
+    from lab.measures.timing import Clock
+
     return Clock(1 if o.smallest else 11, tqdm(desc="rounds", leave=False, disable=None))
 
 
 def ratios(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Measure the library over bare torch: `cuda_*_over_*` of throughput.py."""
+    import throughput
+
     names = [name for name in throughput.FIGURES if name.startswith("cuda_") and "_over_" in name]
     return {name: throughput.FIGURES[name][0](clock(o)) for name in names}
 
 
 def speed(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Measure training steps per second of the paper's transformer: `cuda_steps_per_second`."""
+    import throughput
+
     tiny: dict[str, Any] = {"network": throughput.small_network, "batch": 4} if o.smallest else {}
     return throughput.steps_per_second(clock(o), o.device, **tiny) or {}
 
 
 def train_for(o: GpuOptions, seconds: float, obs: str) -> tuple[Options, list[Policy]]:
     """Train a policy per method, for as many iterations as fit, by the speed of a short training."""
+    from lab.running.comparison import train_all
+
     begun = time.monotonic()
     shutil.rmtree(o.out / obs, ignore_errors=True)  # logs of an interrupted part would mislead
     options, probes = o.policies(obs, o.probe, first=True)
@@ -176,6 +185,10 @@ def training_facts(policy: Policy) -> dict[str, Any]:
 
 def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Train from states, and play episodes."""
+    from lab.running.comparison import EPISODES_PER_JOB
+    from lab.running.jobs import Jobs
+    from lab.running.policies import Cell, play, row
+
     options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
     last = policies[0].training.iterations
     cells: dict[tuple[Policy, Cell], list[Any]] = {
@@ -220,6 +233,7 @@ def commit_of_sources() -> str:
 @script("gpu.py", hint="the same command continues")
 def main(argv: list[str] | None) -> None:
     o = read(GpuOptions(), sys.argv[1:] if argv is None else argv, __doc__)
+
     o.check()
     parts = sorted(set(o.part or PARTS))
     if parts != [0]:

@@ -13,23 +13,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from robomimic import run
 from tqdm import tqdm
 
-from lab.demonstrations.scripted.episode import Episode, write_robomimic
-from lab.demonstrations.scripted.generate import generate_demonstrations
-from lab.demonstrations.tasks import DataOptions
+from lab.demonstrations.data_options import DataOptions
 from lab.options.command_line import script
 from lab.options.options import with_parts
 from lab.options.presets import PRESETS
-from warmprior.data import open_demonstrations
-from warmprior.data.formats.hdf5 import open_robomimic, selected_demos
-from warmprior.envs.control_loop import StepLoop
-from warmprior.envs.simulator import make_simulator, task_env_args
-from warmprior.tasks import Play, Task
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lab.demonstrations.scripted.episode import Episode
+    from warmprior.envs.control_loop import StepLoop
+    from warmprior.tasks import Task
 
 SQUARE, ARM = "square", "robot0_"
 OBSERVATION = ["object", f"{ARM}joint_pos", f"{ARM}gripper_qpos"]
@@ -39,6 +38,8 @@ KP = 300
 
 def joint_env_args() -> dict[str, Any]:
     """Return env_args of square whose actions are seven joint positions in radians and the gripper."""
+    from warmprior.envs.simulator import task_env_args
+
     env_args = task_env_args(SQUARE)
     parts = env_args["env_kwargs"]["controller_configs"]["body_parts"]
     parts["right"] = {
@@ -53,6 +54,10 @@ def joint_env_args() -> dict[str, Any]:
 
 def followed(path: Path, loop: StepLoop) -> Iterator[Episode]:
     """Yield the follower's episode for each demonstration in a file, if it solves the task."""
+    import numpy as np
+
+    from warmprior.data.formats.hdf5 import open_robomimic, selected_demos
+
     with open_robomimic(path) as file:
         names = selected_demos(file, None)
         for index, name in enumerate(tqdm(names, "joint targets", unit="demo")):
@@ -70,6 +75,10 @@ def followed(path: Path, loop: StepLoop) -> Iterator[Episode]:
 
 def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
     """Play targets from a state until the task is solved for six steps."""
+    import numpy as np
+
+    from lab.demonstrations.scripted.episode import Episode
+
     loop.reset(0)
     observations, states, rewards = [loop.set_state(state)], [], []
     for robot in loop.env.robots:
@@ -95,6 +104,11 @@ def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
 
 def demonstrations(style: str, count: int) -> Path:
     """Return the file of the follower's demonstrations; record it if it does not exist."""
+    from lab.demonstrations.scripted.episode import write_robomimic
+    from lab.demonstrations.scripted.generate import generate_demonstrations
+    from warmprior.envs.control_loop import StepLoop
+    from warmprior.envs.simulator import make_simulator
+
     source = generate_demonstrations(SQUARE, style, count)
     path = source.with_name(f"{source.stem}_joint_targets.hdf5")
     if not path.exists():
@@ -108,6 +122,9 @@ def demonstrations(style: str, count: int) -> Path:
 
 def task(options: DataOptions) -> Task:
     """Return the task: the follower's demonstrations, and square under the same controller."""
+    from warmprior.data import open_demonstrations
+    from warmprior.tasks import Play, Task
+
     options.check_only("task", "style", "demonstrations", "horizon")
     style = options.style[0]
     if style not in ("ph", "mh"):

@@ -11,14 +11,10 @@ import argparse
 import sys
 from pathlib import Path
 
-import pandas as pd
-
 from lab.options.command_line import script
 from lab.options.options import Options
 from lab.options.stored_options import stored_options
-from lab.reporting.plots import colors_of, new_figure, save
-from lab.reporting.report import baseline, summary, table
-from lab.reporting.rows import PLAYED, read_rows
+from warmprior.io.script import read_command_line
 
 
 @script("memory.py", hint="")
@@ -28,7 +24,12 @@ def main(argv: list[str] | None) -> None:
     parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
     out = Path("memory.png")
     parser.add_argument("--out", type=Path, default=out, help="picture to write (default: %(default)s)")
-    args = parser.parse_args(argv)
+    args = read_command_line(lambda: parser.parse_args(argv))
+    import pandas as pd
+
+    from lab.reporting.plots import colors_of, new_figure, save
+    from lab.reporting.report import baseline, summary, table
+    from lab.reporting.rows import PLAYED, read_rows
 
     # A row per setting, method and NFE.
     whose = "robomimic.py or pusht.py: name a run of these"

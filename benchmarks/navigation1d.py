@@ -12,20 +12,9 @@ import sys
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pandas as pd
-import torch
-
-from lab.measures.navigation import judge_navigation, play_navigation
-from lab.measures.straightness import check_flows, straightness
 from lab.options.command_line import parse, script, started
 from lab.options.options import Evaluation, Options, Sources, check_single
-from lab.reporting.plots import plot_flow_paths, plot_navigation
-from lab.reporting.report import labelled, table, unlike, write_report
-from lab.running.comparison import train_all
-from lab.running.policies import policies_of, trained_actors, write_rows
-from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.training import NetworkOptions, TrainingConfig
-from warmprior.training.options import PAPER
+from warmprior.options.training import PAPER, NetworkOptions, TrainingConfig
 
 JUDGED = [  # columns of the table
     *("switch_rate", "commit_rate", "collision_rate", "route_entropy", "distance", "jump_ratio"),
@@ -45,6 +34,8 @@ class NavigationOptions(Options):
         return f"h{'-'.join(map(str, self.sources.chunk))}"
 
     def check(self) -> None:
+        from lab.measures.straightness import check_flows
+
         super().check()
         check_single(self, "chunk")
         check_flows(self.sources.methods())
@@ -93,6 +84,17 @@ NAVIGATION_PRESETS = {
 def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
     options = parse(NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, typed: base)
+    import pandas as pd
+    import torch
+
+    from lab.measures.navigation import judge_navigation, play_navigation
+    from lab.measures.straightness import straightness
+    from lab.reporting.plots import plot_flow_paths, plot_navigation
+    from lab.reporting.report import labelled, table, unlike, write_report
+    from lab.running.comparison import train_all
+    from lab.running.policies import policies_of, trained_actors, write_rows
+    from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
+
     with started(options, "navigation1d") as out:
         style = "position" if options.position_only else "toy"
         policies = policies_of(options, ("navigation", style), only=True)

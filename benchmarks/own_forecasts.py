@@ -16,15 +16,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import torch
-from pandas import DataFrame
-
-from lab.measures.source_errors import error_by_position
 from lab.options.command_line import script
-from warmprior.data import open_demonstrations
-from warmprior.diagnostics import SharedObservations
-from warmprior.keys import EPISODE
-from warmprior.saving import load_policy
+from warmprior.io.script import read_command_line
 
 
 @script("own_forecasts.py", hint="")
@@ -40,7 +33,16 @@ def main(argv: list[str] | None) -> None:
     )
     parser.add_argument("--windows", type=int, default=2000, help="number of steps (default: %(default)s)")
     parser.add_argument("--rows", type=Path, help="file to which the rows are added as JSON lines")
-    args = parser.parse_args(argv)
+    args = read_command_line(lambda: parser.parse_args(argv))
+    import torch
+    from pandas import DataFrame
+
+    from lab.measures.source_errors import error_by_position
+    from warmprior.data import open_demonstrations
+    from warmprior.diagnostics import SharedObservations
+    from warmprior.keys import EPISODE
+    from warmprior.saving import load_policy
+
     steps = open_demonstrations(args.dataset).steps(args.observations)
     numbers = steps[EPISODE].unique()
     parts = {"trained on": numbers[: args.demonstrations], "held out": numbers[args.demonstrations :]}

@@ -26,6 +26,12 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from warmprior.io.script import read_command_line, run_script, start_pytorch
+
+if __name__ == "__main__":
+    start_pytorch()  # what is measured is imported before the options are read
+
+# isort: split
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
@@ -46,7 +52,6 @@ from warmprior import (
     window_replay_buffer,
 )
 from warmprior.io.files import check_writable
-from warmprior.io.script import run_script
 
 VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
 
@@ -286,7 +291,7 @@ def run(argv: Sequence[str] | None) -> None:
     add("--repeats", type=int, default=5, help="number of rounds (default: %(default)s)")
     add("--device", default="cpu", help="device, such as cuda (default: %(default)s)")
     add("--out", type=Path, default=Path("runs/peers"), help="output folder (default: %(default)s)")
-    options = parser.parse_args(argv)
+    options = read_command_line(lambda: parser.parse_args(argv))
     if options.repeats < 1 or options.batch_size < 1:
         parser.error("--repeats and --batch-size must be at least 1")
     check_device(options.device)

@@ -15,33 +15,25 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 from navigation1d import NAVIGATION_PRESETS
 
-from lab.demonstrations.tasks import DataOptions
+from lab.demonstrations.data_options import DataOptions
+from lab.options.agents import TOY, AgentOptions, AgentsOptions
 from lab.options.command_line import parse, script, started
 from lab.options.options import Evaluation, Sources, with_parts
 from lab.options.presets import PRESETS, study
-from lab.reporting.plots import plot_lines, plot_success
-from lab.reporting.report import labelled, setting_title, table, write_report
-from lab.reporting.rows import AGENT, read_rows
-from lab.running.agents import (
-    TOY,
-    AgentOptions,
-    AgentsOptions,
-    Arm,
-    encoding,
-    environment,
-    frozen_policies,
-)
-from lab.running.policies import slug, write_rows
-from warmprior import WarmPriorActor
 from warmprior.checks import given
 from warmprior.io.files import read_json
 from warmprior.io.workers import torch_threads
-from warmprior.rl import PriorSpaceTraining
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from lab.options.agents import Arm
+    from warmprior import WarmPriorActor
+    from warmprior.rl import PriorSpaceTraining
 
 TOY_PRESET = NAVIGATION_PRESETS["quick"]
 AGENT_PRESETS: dict[str, AgentsOptions] = {
@@ -136,6 +128,10 @@ def learn(
     options: AgentsOptions, actor: WarmPriorActor, arm: Arm, seed: int, out: Path
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
+    from lab.running.agents import encoding, environment
+    from lab.running.policies import slug
+    from warmprior.rl import PriorSpaceTraining
+
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
     parts = given(horizon=options.data.horizon) | options.evaluation.environment
     rounds = None
@@ -162,6 +158,13 @@ def learn(
 def main(argv: list[str] | None) -> None:
     """Train an agent per algorithm, source and seed, and compare their success."""
     options = parse(AGENT_PRESETS, argv, "rl", __doc__, adapt=adapt)
+    from lab.reporting.plots import plot_success
+    from lab.reporting.report import labelled, setting_title, table, write_report
+    from lab.reporting.rows import AGENT, read_rows
+    from lab.running.agents import frozen_policies
+    from lab.running.policies import write_rows
+    from warmprior.rl.agent import delta_of
+
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
         path = out / "results.jsonl"
@@ -176,7 +179,7 @@ def main(argv: list[str] | None) -> None:
                 "algorithm": arm.algorithm,
                 **arm.method.facts,
                 "centre": arm.centre if arm.method.has_anchor else "",
-                "delta": options.agent(arm, seed).delta_for(arm.policy(actor)),
+                "delta": delta_of(options.agent(arm, seed), arm.policy(actor)),
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }
@@ -210,6 +213,8 @@ def draw(rows: pd.DataFrame, path: Path, title: str, warmup_steps: int) -> None:
     Seeds are averaged evaluation by evaluation. Their numbers of control steps differ slightly, because an
     evaluation waits for the end of a decision; the mean is drawn.
     """
+    from lab.reporting.plots import plot_lines
+
     shown = rows.assign(panel="greedy agent", method=rows.algorithm.str.upper() + ", " + rows.method)
     number = shown.groupby(["method", "seed"]).cumcount()
     same = shown.groupby(["method", number])

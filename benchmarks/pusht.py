@@ -13,20 +13,20 @@ from __future__ import annotations
 
 import sys
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from robomimic import run
-from torchrl.envs import EnvBase
 
-from lab.demonstrations.tasks import DataOptions
+from lab.demonstrations.data_options import DataOptions
 from lab.options.command_line import script
 from lab.options.options import with_parts
 from lab.options.presets import PRESETS
-from warmprior.data import demonstrations_of, open_demonstrations
-from warmprior.envs import gym_env
 from warmprior.io.extras import require
-from warmprior.tasks import Play, Task
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from warmprior.tasks import Task
 
 SIDE = 512.0  # side of the field in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners
@@ -34,6 +34,10 @@ OBSERVATION = ["observation.state", "observation.environment_state"]  # the agen
 
 def make_env(relative: bool = False) -> EnvBase:
     """Make the environment in raw units: actions are target positions of the agent, in pixels."""
+    import numpy as np
+
+    from warmprior.envs import gym_env
+
     require("gym_pusht", "pusht")
     import gymnasium
 
@@ -48,6 +52,9 @@ def make_env(relative: bool = False) -> EnvBase:
 
 def task(options: DataOptions, relative: bool = False) -> Task:
     """Return the task: human demonstrations, and the environment that policies are played in."""
+    from warmprior.data import demonstrations_of, open_demonstrations
+    from warmprior.tasks import Play, Task
+
     options.check_only("task", "dataset", "demonstrations")
     place = options.dataset or "lerobot:lerobot/pusht_keypoints"
     steps = open_demonstrations(place, demos=options.first("human")).steps(OBSERVATION)

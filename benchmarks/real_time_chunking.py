@@ -14,19 +14,17 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from lab.demonstrations.tasks import check_counts
-from lab.methods.methods import Method
+from lab.demonstrations.data_options import check_counts
 from lab.options.command_line import parse, script, started
 from lab.options.options import Options, check_given, check_single
 from lab.options.presets import PRESETS, study
-from lab.reporting.plots import plot_bars
-from lab.reporting.report import counted, labelled, per_seed, table, write_report
-from lab.running.comparison import compare
-from lab.running.policies import Cell, policies_of
-from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.transforms.delay import check_delay
+from warmprior.options.guidance import GuidanceOptions
+
+if TYPE_CHECKING:
+    from lab.methods.methods import Method
+    from lab.running.policies import Cell
 
 STUDY = "real-time-chunking"
 
@@ -39,7 +37,7 @@ class DelayOptions(Options):
     execute: int | None = None  # actions executed per decision (default: H minus the largest delay)
     guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")  # no guidance, Real-Time Chunking, or both
     toy: Literal["beside", "alone", "no"] = "beside"  # play the toy in addition to the tasks, alone, or not
-    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)  # options of the guidance
+    rtc: GuidanceOptions = field(default_factory=GuidanceOptions)  # options of the guidance
 
     @property
     def name(self) -> str:
@@ -48,6 +46,8 @@ class DelayOptions(Options):
         return super().name + ("-navigation" if self.toy == "beside" else "")
 
     def check(self) -> None:
+        from warmprior.transforms.delay import check_delay
+
         super().check()
         check_single(self, "chunk", "temperature")
         check_given(self, "delay", "guidance")
@@ -76,8 +76,11 @@ class DelayOptions(Options):
 
     def conditions(self, method: Method) -> list[Cell]:
         """Return the settings to play a method with: every delay, and every guidance that fits it."""
+        from lab.running.policies import Cell
+        from warmprior.modules.real_time_chunking import RealTimeChunking
+
         execute = self.execute or max(1, self.sources.chunk[0] - max(self.delay))
-        guidances = {"none": None, "rtc": self.rtc}
+        guidances = {"none": None, "rtc": RealTimeChunking(**vars(self.rtc))}
         return [
             Cell(0, 0, delay, execute, guidances[name])
             for delay in sorted(set(self.delay))
@@ -95,6 +98,11 @@ def main(argv: list[str] | None) -> None:
         for name, base in PRESETS.items()
     }
     options = parse(presets, argv, STUDY, __doc__)
+    from lab.reporting.plots import plot_bars
+    from lab.reporting.report import counted, labelled, per_seed, table, write_report
+    from lab.running.comparison import compare
+    from lab.running.policies import policies_of
+
     with started(options, STUDY) as out:
         toy = [] if options.toy == "no" else [("navigation", "toy")]
         alone = options.toy == "alone"

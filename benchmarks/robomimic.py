@@ -17,11 +17,7 @@ from typing import Any
 from lab.options.command_line import parse, script, started
 from lab.options.options import Options
 from lab.options.presets import PRESETS, WHY_QUICK
-from lab.reporting.report import success_report, summary, terminal_table, unlike, write_report
-from lab.running.comparison import compare
 from lab.running.phases import Phases
-from lab.running.pictures import draw, films
-from lab.running.policies import policies_of
 
 
 def run(
@@ -30,6 +26,11 @@ def run(
     """Run the whole benchmark: options, data, training and playing, table and pictures."""
     phases = Phases()
     options = parse(presets, argv, study, doc, **parsing)
+    from lab.reporting.report import success_report, summary, terminal_table, unlike, write_report
+    from lab.running.comparison import compare
+    from lab.running.pictures import draw, films
+    from lab.running.policies import policies_of
+
     phases.end("imports and options")
     with started(options, study) as out:
         # Demonstrations are generated, downloaded, or read from --dataset. There is a policy per task, method

@@ -13,19 +13,9 @@ import math
 import sys
 from dataclasses import replace
 
-import pandas as pd
-
-from lab.demonstrations.tasks import title_of
-from lab.measures.straightness import check_flows, straightness
 from lab.options.command_line import parse, script, started
 from lab.options.options import MeasuredOptions, Options, check_single
 from lab.options.presets import PRESETS, study
-from lab.reporting.paper import paper_success
-from lab.reporting.plots import plot_lines
-from lab.reporting.report import labelled, per_seed, pooled, table, write_report
-from lab.running.comparison import compare
-from lab.running.measuring import held_out
-from lab.running.policies import policies_of, trained_actors, write_rows
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 
@@ -41,6 +31,17 @@ def main(argv: list[str] | None) -> None:
     """Train a policy per source and sigma, play it, and measure its flow."""
     presets = {name: preset(base) for name, base in PRESETS.items()}
     options = parse(presets, argv, "sigma", __doc__)
+    import pandas as pd
+
+    from lab.demonstrations.tasks import title_of
+    from lab.measures.straightness import check_flows, straightness
+    from lab.reporting.paper import paper_success
+    from lab.reporting.plots import plot_lines
+    from lab.reporting.report import labelled, per_seed, pooled, table, write_report
+    from lab.running.comparison import compare
+    from lab.running.measuring import held_out
+    from lab.running.policies import policies_of, trained_actors, write_rows
+
     check_single(options, "nfe", "temperature")
     check_flows(options.sources.methods())
     with started(options, "sigma") as out:

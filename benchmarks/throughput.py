@@ -22,6 +22,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from warmprior.io.script import read_command_line, start_pytorch
+
+if __name__ == "__main__":
+    start_pytorch()  # what is measured is imported before the options are read
+
+# isort: split
 import numpy as np
 import torch
 import torch.distributed
@@ -48,8 +54,8 @@ from warmprior.data import open_demonstrations
 from warmprior.deploy import export_policy, load_exported
 from warmprior.envs import RobosuiteEnv
 from warmprior.io.distributed import joined, rank
+from warmprior.options.training import PAPER
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
-from warmprior.training.options import PAPER
 
 BATCH = 256
 
@@ -516,7 +522,7 @@ def main(argv: list[str] | None) -> None:
     add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"figures of {names} (default: all)")
     add("--out", type=Path, default=out, help="folder of throughput.json (default: %(default)s)")
     add("--repeats", type=int, default=11, help="rounds per figure (default: %(default)s)")
-    options = parser.parse_args(argv)
+    options = read_command_line(lambda: parser.parse_args(argv))
     if options.repeats < 1:
         parser.error("--repeats must be at least 1")
     path = options.out / "throughput.json"

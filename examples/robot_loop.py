@@ -27,7 +27,7 @@ from tensordict import TensorDict
 from warmprior import PastPrior, WarmPriorActor
 from warmprior.checks import check_not_negative, check_positive
 from warmprior.deploy import AsyncExecutor
-from warmprior.io.script import ERRORS, run_script
+from warmprior.io.script import ERRORS, read_command_line, run_script
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 PATIENCE = 1.0
@@ -237,9 +237,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--decision", type=float, default=0.0, help="extra seconds per decision (default: %(default)s)")
     add("--unplug", type=float, default=math.inf, help="seconds until the robot stops answering")
     add("--iterations", type=int, default=300, help="iterations of the training (default: %(default)s)")
-    options = parser.parse_args(argv)
     # Errors become one line, and PyTorch has one thread, which leaves a core to the loop.
-    return run_script(lambda: play(options), "robot_loop.py", errors=(*ERRORS, RuntimeError))
+    return run_script(
+        lambda: play(read_command_line(lambda: parser.parse_args(argv))),
+        "robot_loop.py",
+        errors=(*ERRORS, RuntimeError),
+    )
 
 
 def play(options: argparse.Namespace) -> None:

@@ -110,7 +110,7 @@ def test_folders_are_used_without_locks_where_the_system_has_none(fresh):
 
 
 ROOMS = [
-    *("io", "modules", "lerobot", "transforms", "objectives", "deploy"),
+    *("options", "io", "modules", "lerobot", "transforms", "objectives", "deploy"),
     *("envs", "data", "diagnostics", "saving", "tasks", "evaluation", "training", "rl"),
 ]
 """Each may import those before it alone."""

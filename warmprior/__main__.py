@@ -5,43 +5,26 @@ from __future__ import annotations
 import importlib
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial, wraps
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-if __name__ == "__main__":
-    print("warmprior: importing PyTorch", file=sys.stderr, flush=True)  # it takes seconds
-
-# isort: split
-import torch
 import tyro
-from tensordict import TensorDict, TensorDictBase
 
 from warmprior.checks import check_device, check_whole_numbers, given
-from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
-from warmprior.keys import FRAME
-from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.ode import Sampling
-from warmprior.modules.prior import Prior
-from warmprior.modules.resize import Resizing
-from warmprior.saving import load_policy, model_card
-from warmprior.saving.policies import (
-    check_repository,
-    policy_file,
-    push_policy,
-    save_policy,
-)
-from warmprior.tasks import Play, Task
-from warmprior.training import NetworkOptions, TrainingConfig, train_policy
-from warmprior.training.cloning import policy_path
-from warmprior.training.option_text import make
-from warmprior.transforms.absolute_actions import Actions
-from warmprior.transforms.window import window_transforms
+from warmprior.options.data import Actions, Resizing
+from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.training import NetworkOptions, TrainingConfig
+
+if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
+    from tensordict import TensorDictBase
+
+    from warmprior.modules.actor import WarmPriorActor
 
 Imported = tyro.conf.UseAppendAction[
     Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE")]
@@ -52,6 +35,8 @@ Policy = Annotated[str, tyro.conf.arg(metavar="FOLDER")]
 
 
 def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPriorActor:
+    from warmprior.saving import load_policy
+
     for module in modules:
         importlib.import_module(module)
     return load_policy(folder, revision=revision)
@@ -68,6 +53,8 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     """
     from warmprior.deploy.observation import observation_shapes
     from warmprior.envs.description import environment_name
+    from warmprior.modules.network import VelocityNetwork
+    from warmprior.saving.policies import policy_file
 
     actor = _policy(folder, revision, modules)
     count, recording = sum(p.numel() for p in actor.parameters()), actor.recording
@@ -113,6 +100,9 @@ def push(
         revision: branch of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
+    from warmprior.saving import model_card
+    from warmprior.saving.policies import check_repository, push_policy
+
     check_repository(repository)
     if not Path(folder).is_dir():
         raise FileNotFoundError(f"no policy at {folder}: there is no such folder")
@@ -236,7 +226,9 @@ def improve(
         revision: branch, tag or commit of the repository; by default main
         modules: module that defines your own prior, start point or network; may be repeated
     """
+    from warmprior.rl.agent import delta_of
     from warmprior.rl.improve import SMALL, improve_policy
+    from warmprior.saving.policies import save_policy
 
     actor = _policy(folder, revision, modules)
     warmup = min(SMALL.warmup_steps, steps)
@@ -251,7 +243,7 @@ def improve(
         seed=seed,
     )
     print(
-        f"{algorithm} around a box of +-{config.delta_for(actor):g}: {steps:,} control steps, the first "
+        f"{algorithm} around a box of +-{delta_of(config, actor):g}: {steps:,} control steps, the first "
         f"{warmup:,} without an agent; {config.updates} updates per step of {num_envs} simulators, discount "
         f"{config.gamma:g} per chunk, NFE {config.nfe}",
         flush=True,
@@ -301,42 +293,81 @@ class Data(Resizing):
     horizon: int | None = None
 
 
+@dataclass(frozen=True)
+class Source:
+    """The options of the source.
+
+    Attributes:
+        prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
+            in past,sigma=0.3
+        chunk: chunk length H
+    """
+
+    prior: str = "past,correlation=0.5"
+    chunk: int = 8
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The options of the evaluation.
+
+    Attributes:
+        nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
+        held_out: number of last demonstrations to leave out for measuring the error of actions; by default
+            a tenth if no environment is known, else none
+    """
+
+    nfe: int | None = None
+    held_out: int | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """The options of the computation, and of what it writes.
+
+    Attributes:
+        out: folder of training runs, in which an interrupted one continues
+        device: device of the network, such as cuda
+    """
+
+    out: Path = Path("policies")
+    device: str = "cpu"
+
+
 def train(
     place: Annotated[str, tyro.conf.arg(metavar="PLACE")],
     /,
     *,
-    network: NetworkOptions,
-    training: TrainingConfig,
     data: Data,
-    prior: str = "past,correlation=0.5",
-    chunk: int = 8,
-    nfe: int | None = None,
-    held_out: int | None = None,
-    out: Path = Path("policies"),
-    device: str = "cpu",
+    source: Source,
+    training: TrainingConfig,
+    evaluation: Evaluation,
+    run: Run,
+    network: NetworkOptions,
 ) -> None:
     """Train a policy on demonstrations, without playing episodes.
 
     Args:
         place: a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
-        network: options of the velocity network
-        training: options of the recipe
         data: options of the demonstrations
-        prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
-            in past,sigma=0.3
-        chunk: chunk length H
-        nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
-        held_out: number of last demonstrations to leave out for measuring the error of actions; by default
-            a tenth if no environment is known, else none
-        out: folder of training runs, in which an interrupted one continues
-        device: device of the network, such as cuda
+        source: options of the source
+        training: options of the recipe
+        evaluation: options of the evaluation
+        run: options of the computation, and of what it writes
+        network: options of the velocity network
     """
     from warmprior.data import open_demonstrations
     from warmprior.envs.description import is_registered
+    from warmprior.modules.ode import Sampling
+    from warmprior.modules.prior import Prior
+    from warmprior.tasks import Play, Task
+    from warmprior.training import train_policy
+    from warmprior.training.cloning import policy_path
+    from warmprior.training.option_text import make
 
-    check_device(device)  # before the demonstrations are read
-    source, options = make(Prior, prior, chunk), prior.split(",")[1:]
-    sampling = Sampling(nfe=nfe, max_nfe=1 if training.times == "start" else None)
+    check_device(run.device)  # before the demonstrations are read
+    prior, options = make(Prior, source.prior, source.chunk), source.prior.split(",")[1:]
+    sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
         place,
         demos=data.demonstrations,
@@ -366,21 +397,21 @@ def train(
             print(f"no episodes can be played here, so the policy is only trained: {missing}")
     count = whole.facts["demonstrations"]
     tenth = count // 10 if whole.environment is None else 0
-    task, left_out = whole.split(tenth if held_out is None else held_out)
+    task, left_out = whole.split(tenth if evaluation.held_out is None else evaluation.held_out)
     print(task.recording.text("--{}"), flush=True)
-    name = f"{task.name}-{task.style}-{','.join([source.name, *options])}-seed{training.seed}"
+    name = f"{task.name}-{task.style}-{','.join([prior.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,
-        source,
-        out / name,
+        prior,
+        run.out / name,
         nfe=sampling.evaluations(),
         max_nfe=sampling.max_nfe,
         network=network,
         training=training,
-        device=device,
+        device=run.device,
         description=name,
     )
-    saved = policy_path(out / name, training.iterations)
+    saved = policy_path(run.out / name, training.iterations)
     nfes = (1, 3, 9) if sampling.max_nfe is None else (1,)
     if left_out is not None:
         spread = float(left_out["action"].var(0, correction=0).mean())
@@ -400,7 +431,12 @@ def train(
 
 def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:
     """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
+    import torch
+    from tensordict import TensorDict
+
     from warmprior.diagnostics import action_error, encoded_windows
+    from warmprior.keys import FRAME
+    from warmprior.transforms.window import window_transforms
 
     network: Any = actor.network
     windows = window_transforms(data, actor.prior, observation_steps=network.observation_steps)
@@ -484,26 +520,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         parsed: Any = read_command_line(
             partial(
                 tyro.extras.subcommand_cli_from_dict,
-                {command.__name__: _deferred(command) for command in COMMANDS},
+                {command.__name__: deferred(command) for command in COMMANDS},
                 prog="python -m warmprior",
                 description=f"{__doc__}\n\nOptions of a command: COMMAND --help. The version: --version.",
                 args=argv,
+                registry=registry,
                 config=(tyro.conf.OmitArgPrefixes,),  # --iterations, not --training.iterations
             )
         )
         parsed()
 
     return run_script(run, "warmprior")
-
-
-def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """Return a function with the same options, whose result runs the command."""
-
-    @wraps(command)
-    def bound(*args: Any, **options: Any) -> Callable[[], None]:
-        return partial(command, *args, **options)
-
-    return bound
 
 
 if __name__ == "__main__":

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+if TYPE_CHECKING:  # options are checked before PyTorch is imported
+    import torch
+    from tensordict.utils import NestedKey
+    from torch import Tensor
 
 LARGEST = 1e9
 """The largest number in any unit: a larger one is damage, which squashes all others or overflows."""
@@ -73,6 +74,8 @@ def all_usable(values: Tensor) -> bool:
 
 def is_true(key: NestedKey, value: Any) -> bool:
     """Return a flag that says whether a task is solved; raise ValueError for all but 0 and 1."""
+    import torch
+
     number = torch.as_tensor(value)
     if number.numel() != 1 or number.item() not in (0, 1):
         raise ValueError(
@@ -96,6 +99,8 @@ def check_distinct(what: str, names: Sequence[str]) -> None:
 
 def check_device(device: torch.device | str) -> None:
     """Raise ValueError if a device, such as ``"cuda"``, is unknown or does not work."""
+    import torch
+
     try:
         # Compute and read a value: some devices exist only by name, such as meta.
         torch.ones(1, device=device).add(1).item()
@@ -118,6 +123,8 @@ def check_shape(name: str, value: Any, expected: Sequence[int | str]) -> None:
 
 def check_keys(place: Any, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
     """Raise KeyError, with a hint, for needed keys that a tensordict or spec lacks."""
+    from tensordict.utils import unravel_key
+
     needed = list(needed)
     try:
         missing = [key for key in needed if place.get(key, None) is None]
@@ -138,6 +145,8 @@ def check_positions(key: NestedKey, chunk: Tensor, prior: Any) -> None:
 
 def check_finite_steps(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
     """Raise ValueError for the first NaN or infinity of data ``[N, *]``, which may be memory-mapped."""
+    import torch
+
     if not value.is_floating_point():
         return
     steps = max(1, memory * len(value) // max(1, value.numel()))
@@ -154,6 +163,8 @@ def check_finite(
     cause: str = "the training has diverged; lower the learning rate or check the rewards",
 ) -> None:
     """Raise FloatingPointError at NaN or infinity, with the tensors' names and what to check."""
+    import torch
+
     wrong = [str(name) for name, value in tensors.items() if not torch.isfinite(value).all()]
     if wrong:
         more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""

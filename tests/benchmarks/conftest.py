@@ -56,8 +56,8 @@ def inline(request, short_episodes):
         local = jobs.Local
         patch.setattr(jobs, "Local", Inline)
         patch.setattr(pictures, "rendering_backend", lambda: None)
-        charts = ("curvature.flow_paths", "navigation1d.flow_paths")
-        places = ("lab.running.measuring.curvature", "lab.measures.straightness.curvature", *charts)
+        places = ("lab.running.measuring.curvature", "lab.measures.straightness.curvature")
+        places += ("warmprior.diagnostics.flow_paths",)  # which scripts import when they draw
         for place in places if request.path.name != "test_measures.py" else ():  # there they are compared
             module, name = place.rsplit(".", 1)
             measure = getattr(importlib.import_module(module), name)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from lab.demonstrations.data_options import DataOptions
 from lab.demonstrations.scripted.generate import generate_demonstrations
-from lab.demonstrations.tasks import DataOptions
 from tests.processes import here
 from warmprior.data import convert_robomimic, open_demonstrations
 from warmprior.envs.tasks import TaskSpec

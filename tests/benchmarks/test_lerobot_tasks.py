@@ -5,7 +5,7 @@ import pytest
 import robomimic
 import torch
 
-from lab.demonstrations.tasks import DataOptions
+from lab.demonstrations.data_options import DataOptions
 from tests.benchmarks.script_parts import described, flow, options, stored, written
 from tests.errors import raises
 from warmprior.data import DatasetError, convert_robomimic

@@ -34,7 +34,8 @@ from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
 from warmprior.envs.tasks import TASKS
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
-from warmprior.training import NetworkOptions, TrainingConfig
+from warmprior.rl.agent import delta_of
+from warmprior.training import NetworkOptions, TrainingConfig, make_network
 from warmprior.training.optim import ema_of, make_optimizer
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
@@ -79,7 +80,7 @@ def optimized(optimizer):
 
 def recipe(options):
     """The rows of Table 3, from what the options build."""
-    network, training = options.network.make(7, 9, 8), options.training
+    network, training = make_network(options.network, 7, 9, 8), options.training
     (dropout,) = {module.p for module in network.modules() if isinstance(module, nn.Dropout)}
     rates = values(training, ("learning_rate", "weight_decay"))
     found = {
@@ -105,7 +106,9 @@ def evaluation(options, **others):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_recipe_from_the_state(name, monkeypatch):
     preset, usual = presets_of(name, monkeypatch)["paper"], facts.EVALUATION
-    assert isinstance(preset.network.make(7, 9, 8), ChiTransformer) and not preset.network.precondition
+    assert (
+        isinstance(make_network(preset.network, 7, 9, 8), ChiTransformer) and not preset.network.precondition
+    )
     assert recipe(preset) == STATE
     # Two studies have one NFE, and one has all chunk lengths.
     own = {name: {"nfe": usual["nfe"]} for name in ("sigma", "real_time_chunking")}
@@ -124,7 +127,7 @@ def test_the_recipe_from_images(monkeypatch):
     assert recipe(with_parts(paper, data={"obs": "image"})) == IMAGE
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
-    monkeypatch.setattr("lab.options.presets.imagenet_weights", lambda: None)  # nothing is downloaded
+    monkeypatch.setattr("warmprior.modules.encoder.imagenet_weights", lambda: None)  # nothing is downloaded
     asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
@@ -154,7 +157,7 @@ def test_the_preset_of_the_public_code_from_the_state(name, monkeypatch):
 
 def test_the_preset_of_the_public_code_from_images(monkeypatch):
     pytest.importorskip("torchvision")
-    monkeypatch.setattr("lab.demonstrations.tasks.require_rendering", lambda: None)
+    monkeypatch.setattr("warmprior.envs.rendering.require_rendering", lambda: None)
     argv = ["--preset", "much-ado", "--obs", "image", "--out", "out"]
     adapted = {
         name: with_parts(with_parts(PRESETS[name], **IMAGES[name]), data={"obs": "image"})
@@ -165,13 +168,13 @@ def test_the_preset_of_the_public_code_from_images(monkeypatch):
         assert presets["much-ado"].data.actions == "delta"
     read = parse(PRESETS, argv, "robomimic", None)
     assert with_parts(read, run=vars(adapted["much-ado"].run)) == adapted["much-ado"]
-    network = read.network.make(7, 9, 8, {"agentview_image": 84})
+    network = make_network(read.network, 7, 9, 8, {"agentview_image": 84})
     observation_layers = network.network.observation_layers
     assert (observation_layers, network.encoder.backbone) == (2, "resnet18")
 
 
 def test_what_the_preset_of_the_public_code_builds():
-    network = PRESETS["much-ado"].network.make(10, 9, 8)
+    network = make_network(PRESETS["much-ado"].network, 10, 9, 8)
     angles = network.embed_time[0].frequencies
     assert (angles.max().item(), angles.min().item()) == (
         1.0,
@@ -198,7 +201,7 @@ def test_defaults_of_the_library():
 
 def test_the_images_network_has_group_norm():
     pytest.importorskip("torchvision")
-    encoder = NetworkOptions("plain_mlp", encoder="resnet18").make(7, 9, 8, {"camera": 84}).encoder
+    encoder = make_network(NetworkOptions("plain_mlp", encoder="resnet18"), 7, 9, 8, {"camera": 84}).encoder
     kinds = {type(module) for module in encoder.modules() if "Norm" in type(module).__name__}
     assert kinds == {nn.GroupNorm} and encoder.backbone == "resnet18"
 
@@ -302,7 +305,7 @@ def test_the_study_without_chunks(monkeypatch):
 def test_the_toy(monkeypatch):
     presets, toy = presets_of("navigation1d", monkeypatch), facts.TOY
     preset = presets["paper"]
-    network = preset.network.make(1, facts.TOY_OBSERVATION_DIM, 4)
+    network = make_network(preset.network, 1, facts.TOY_OBSERVATION_DIM, 4)
     layers = [module for module in network.modules() if isinstance(module, nn.Linear)]
     assert isinstance(network, PlainMLP) and len(layers) == toy["layers"]
     widths = {layer.out_features for layer in layers[:-1]}
@@ -330,7 +333,7 @@ def test_the_agents():
         prior = kind(2)
         actor = WarmPriorActor(VelocityMLP(1, 1, prior.prediction_length, hidden_dim=8), prior)
         expected = facts.BOX_AROUND_ZERO if name == "gaussian" else facts.BOX_AROUND_MEAN
-        assert PriorSpaceConfig().delta_for(actor) == expected
+        assert delta_of(PriorSpaceConfig(), actor) == expected
     assert presets["unit"].delta == (facts.BOX_AROUND_MEAN, facts.BOX_AROUND_ZERO)
 
 

@@ -21,9 +21,9 @@ from tests.processes import apart
 from tests.together import together
 from warmprior import RealTimeChunking, policy_transforms
 from warmprior.diagnostics import smoothness
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.evaluation import play_episode
 from warmprior.io.distributed import rank, world_size
+from warmprior.options.evaluation import EVALUATION_SEED
 
 
 def untimed(out):

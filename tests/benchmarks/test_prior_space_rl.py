@@ -7,6 +7,7 @@ import pytest
 import robomimic
 
 from lab.options.command_line import parse
+from lab.running.agents import environment, frozen_policies
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
 from tests.errors import raises
 from warmprior import VelocityMLP, WarmPriorActor
@@ -106,7 +107,7 @@ def test_around_zero_the_source_is_what_the_agent_says(prior, length):
     around_mean, around_zero = (arm.policy(actor) for arm in recipe.arms(method))
     assert around_mean is actor and has_anchor(actor)
     assert around_zero.network is network and not has_anchor(around_zero)
-    environments = (benchmark.environment(p, True, 2, {}, 0) for p in (around_mean, around_zero))
+    environments = (environment(p, True, 2, {}, 0) for p in (around_mean, around_zero))
     anchors = [env.rollout(2)["prior", "anchor"] for env in environments]
     assert anchors[0].shape == anchors[1].shape == (2, 2, length, 1)
     assert anchors[0].any() and not anchors[1].any()
@@ -122,7 +123,7 @@ def test_the_time_limit_is_that_of_the_policys_environment_unless_one_is_given(t
         def run(self):
             pass
 
-    monkeypatch.setattr(benchmark, "PriorSpaceTraining", Recorded)
+    monkeypatch.setattr("warmprior.rl.PriorSpaceTraining", Recorded)
     for words, found in (("", {}), ("--horizon 20", {"horizon": 20})):
         recipe = read(f"--task can --prior past {words}")
         (method,) = recipe.sources.methods()
@@ -166,7 +167,7 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     before = written(tmp_path)
 
     def frozen(priors):
-        found = benchmark.frozen_policies(read(f"--run {run} --out {out} --seeds 1 {priors}"))[1]
+        found = frozen_policies(read(f"--run {run} --out {out} --seeds 1 {priors}"))[1]
         sources = [actors[0].prior for actors in found.values()]
         return [(prior.name, getattr(prior, "correlation", 0.0)) for prior in sources]
 

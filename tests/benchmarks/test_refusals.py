@@ -25,7 +25,7 @@ def no_work(monkeypatch):
         *(f"lab.demonstrations.tasks.{name}" for name in loaders),
     ):
         monkeypatch.setattr(place, never)
-    for place in ("lab.demonstrations.tasks.require_rendering", "warmprior.envs.mimicgen.find_spec"):
+    for place in ("warmprior.envs.rendering.require_rendering", "warmprior.envs.mimicgen.find_spec"):
         monkeypatch.setattr(place, lambda *names: None)
 
 

@@ -12,7 +12,7 @@ import robomimic
 import sigma
 import torch
 
-from lab.demonstrations.tasks import DataOptions
+from lab.demonstrations.data_options import DataOptions
 from lab.options.options import MeasuredOptions, Options, Run, Sources
 from lab.running import policies as common
 from lab.running.measuring import held_out

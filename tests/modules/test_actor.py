@@ -12,7 +12,8 @@ from tests.errors import raises
 from tests.toy_env import CountingEnv, Halfway, mlp_actor, random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, keys, policy_transforms
 from warmprior.history import ENTRIES, advance, cold_history
-from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig
+from warmprior.options.agent import PriorSpaceConfig
+from warmprior.rl.agent import PriorSpaceAgent
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 H, D_A, D_O, TO = 3, 2, 5, 2

@@ -10,7 +10,8 @@ from tensordict import NonTensorStack, TensorDict
 from torchrl.envs import RenameTransform, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from lab.demonstrations.tasks import DataOptions, load_task, longest_of, read_like, title_of
+from lab.demonstrations.data_options import DataOptions
+from lab.demonstrations.tasks import load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises
 from tests.rl.test_images import CameraEnv

@@ -24,11 +24,11 @@ from tests.training.cloning_parts import (
     weights,
 )
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
+from warmprior.options.training import PAPER
 from warmprior.saving import load_policy
 from warmprior.saving.checkpoint import load_state
 from warmprior.training import TrainingConfig
 from warmprior.training.optim import make_optimizer
-from warmprior.training.options import PAPER
 
 LATER = {"times": "u-shaped", "objective": "l1"}
 """Options beside Algorithm 1's; the average is the teacher."""

@@ -17,7 +17,7 @@ from warmprior.deploy import AsyncExecutor
 from warmprior.evaluation import evaluate
 from warmprior.modules import PreconditionedNetwork
 from warmprior.saving import load_policy
-from warmprior.training import NetworkOptions, TrainingConfig, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, make_network, train_policy
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
@@ -129,12 +129,15 @@ def test_what_does_not_exist_is_refused_with_what_does():
 def test_options_of_transformers_reach_them_alone(name, value):
     for network in ("chi_transformer", "adaln_transformer"):
         usual, made = (
-            NetworkOptions(network, hidden_dim=12, **more).make(2, 3, 4) for more in ({}, {name: value})
+            make_network(NetworkOptions(network, hidden_dim=12, **more), 2, 3, 4)
+            for more in ({}, {name: value})
         )
         assert made.config() == usual.config() | {name: value} != usual.config()
-    assert NetworkOptions("chi_transformer").make(2, 3, 4).config() == ChiTransformer(2, 3, 4).config()
+    assert (
+        make_network(NetworkOptions("chi_transformer"), 2, 3, 4).config() == ChiTransformer(2, 3, 4).config()
+    )
     seeing = NetworkOptions("chi_transformer", hidden_dim=12, encoder="small", crop_size=8, **{name: value})
-    network = seeing.make(2, 3, 4, {"camera": 10})  # behind an encoder of images
+    network = make_network(seeing, 2, 3, 4, {"camera": 10})  # behind an encoder of images
     assert network.config()["network"][name] == value
     images = {"state": torch.zeros(5, 2, 3), "camera": torch.zeros(5, 2, 3, 10, 10, dtype=torch.uint8)}
     assert network(torch.rand(5), torch.randn(5, 4, 2), TensorDict(images, [5])).shape == (5, 4, 2)

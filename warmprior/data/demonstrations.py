@@ -17,8 +17,8 @@ from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.recording import AS_RECORDED, Recording
-from warmprior.modules.resize import IMAGE_SIZE, Resize
 from warmprior.modules.trend import vector_of
+from warmprior.options.data import IMAGE_SIZE, Resize
 
 ROWS = 2_000  # number of steps that decide if an observation is an action
 LATER = 16  # up to so many steps later, as long as most chunks

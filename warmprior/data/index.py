@@ -23,7 +23,7 @@ from warmprior.checks import (
 )
 from warmprior.envs.env_args import declared_actions
 from warmprior.envs.tasks import TaskSpec
-from warmprior.modules.resize import Resize
+from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
 MISFIT = "They do not fit these actions: correct one or the other."

@@ -15,7 +15,8 @@ from warmprior.checks import check_keys
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.index import BLOCK, DatasetIndex
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE
-from warmprior.modules.resize import Resize, resized
+from warmprior.modules.resize import resized
+from warmprior.options.data import Resize
 
 
 def demonstrations_of(

@@ -17,7 +17,8 @@ from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.recording import Recording
-from warmprior.modules.resize import Resize, resized
+from warmprior.modules.resize import resized
+from warmprior.options.data import Resize
 from warmprior.transforms.history import HistoryObservation
 
 

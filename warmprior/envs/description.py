@@ -16,7 +16,8 @@ from warmprior.envs.gymnasium import registered_env
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import uncompiled
-from warmprior.transforms.absolute_actions import AbsoluteActions, Actions
+from warmprior.options.data import Actions
+from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 

@@ -8,10 +8,6 @@ from typing import Any
 
 from warmprior.checks import check_choice
 
-#: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
-#: so a policy is never evaluated on an initial state it was trained on.
-EVALUATION_SEED = 10_000_000
-
 #: Styles of demonstrations: robomimic's one or six operators, MimicGen's ten human ones and their variations.
 STYLES = ("ph", "mh", "source", "core")
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-
-import torch
-import torch.distributed as dist
+from typing import TYPE_CHECKING, Any
 
 from warmprior.io.workers import stop_forking
+
+if TYPE_CHECKING:
+    import torch.distributed as dist
 
 STEP = timedelta(minutes=10)
 """How long the others may take to arrive where gradients are averaged."""
@@ -30,12 +32,18 @@ def launched() -> bool:
 
 def world_size() -> int:
     """Return the number of processes that train together: 1 unless this one has :func:`joined` others."""
-    return dist.get_world_size() if dist.is_initialized() else 1
+    return _joined().get_world_size() if _joined() else 1
 
 
 def rank() -> int:
     """Return this process's number. Process 0 is the leader: only it writes and prints."""
-    return dist.get_rank() if dist.is_initialized() else 0
+    return _joined().get_rank() if _joined() else 0
+
+
+def _joined() -> Any:
+    """Return the module of joined processes, or ``None``; a process alone need not import PyTorch to know."""
+    module = sys.modules.get("torch.distributed")
+    return module if module is not None and module.is_initialized() else None
 
 
 @contextmanager
@@ -54,6 +62,9 @@ def joined() -> Iterator[None]:
     if not launched():
         yield
         return
+    import torch
+    import torch.distributed as dist
+
     local, devices = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
     if local < devices:
         torch.cuda.set_device(local)  # "cuda" is this one from here on
@@ -79,6 +90,8 @@ def from_leader[T](make: Callable[[], T]) -> T:
     """
     if world_size() == 1:
         return make()
+    import torch.distributed as dist
+
     made: list[T] = []
     try:
         if not rank():

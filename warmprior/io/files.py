@@ -15,10 +15,12 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psutil
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 

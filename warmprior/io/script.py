@@ -1,4 +1,4 @@
-"""Scripts: an error that a user can mend, and Ctrl-C, become one line."""
+"""Scripts: their options come before PyTorch; an error that a user can mend, and Ctrl-C, become one line."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
-
-import torch
 
 from warmprior.io.distributed import joined, launched, rank
 from warmprior.io.workers import WorkerError
@@ -44,10 +42,6 @@ def run_script(
         train.py: error: invalid literal for int() with base 10: 'eight'
         2
     """
-    # Policies are shared between scripts, so all of them use the same precision and threads. Small networks
-    # are no faster with a second thread, and on a busy machine threads that wait for each other cost much.
-    torch.set_float32_matmul_precision("high")
-    torch.set_num_threads(1)
     interrupted = False
 
     def interrupt(number: int, frame: Any) -> None:
@@ -59,6 +53,8 @@ def run_script(
     try:
         if launched() and not together:
             raise ValueError("it trains with one process; start it without torchrun")
+        if launched():  # processes join before the options are read
+            start_pytorch()
         with joined(), open(os.devnull, "w") as nowhere, redirect_stdout(nowhere if rank() else sys.stdout):
             script()
     except BaseException as error:
@@ -77,7 +73,9 @@ def run_script(
 
 
 def read_command_line[T](parse: Callable[[], T]) -> T:
-    """Read a command line with tyro, as ``parse`` does; tyro reports unknown options and exits.
+    """Read a command line with tyro or argparse, as ``parse`` does, and start PyTorch; help does without it.
+
+    Unknown options are reported, and the process exits.
 
     Raises:
         ValueError: if an option has a value that its dataclass refuses.
@@ -85,10 +83,32 @@ def read_command_line[T](parse: Callable[[], T]) -> T:
     stderr = io.StringIO()
     try:
         with redirect_stderr(stderr):
-            return parse()
+            try:
+                options = parse()
+            finally:
+                sys.stdout.flush()
+    except BrokenPipeError:  # the reader of the help, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+        raise SystemExit(128 + signal.SIGPIPE) from None
     except SystemExit as stop:
         cause: Any = stop.__context__
         if isinstance(getattr(cause, "arg", None), str):
             raise ValueError(str(cause.message)) from None
         sys.stderr.write(stderr.getvalue())
         raise
+    start_pytorch()
+    return options
+
+
+def start_pytorch() -> None:
+    """Import PyTorch, which takes seconds, and say so; set what all scripts share.
+
+    Policies are shared between scripts, so all of them use the same precision and threads. Small networks are
+    no faster with a second thread, and on a busy machine threads that wait for each other cost much.
+    """
+    if "torch" not in sys.modules:
+        sys.stderr.write("importing PyTorch\n")
+    import torch
+
+    torch.set_float32_matmul_precision("high")
+    torch.set_num_threads(1)

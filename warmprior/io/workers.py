@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
-import torch
-
 _forks = True
 
 
@@ -39,6 +37,8 @@ def start_method() -> str:
 
     Autograd does not work in a fork of a process that used it if there is a GPU.
     """
+    import torch
+
     if not _forks or torch.cuda.is_available():
         return "spawn"
     count_devices()
@@ -48,6 +48,8 @@ def start_method() -> str:
 @cache
 def count_devices() -> None:
     """Let autograd count devices now, where there is none: it does so at its first gradient, and once."""
+    import torch
+
     torch.ones((), requires_grad=True).backward()
 
 
@@ -74,6 +76,8 @@ def end_with_parent() -> None:
 @contextmanager
 def torch_threads(number: int | None) -> Iterator[None]:
     """Let PyTorch compute with as many threads (``None`` leaves them), and as before afterwards."""
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(number or before)
     try:

@@ -26,7 +26,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config, kept_arguments
-from warmprior.modules.resize import IMAGE_SIZE, Resize
+from warmprior.options.data import IMAGE_SIZE, Resize
 
 Backbone = Literal["resnet18", "small"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,6 +18,7 @@ from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.modules.trend import VARIANCE_FLOOR, RestingTrend, vector_of
+from warmprior.options.training import Slope
 
 CORRELATION_LIMIT = 1 - 1e-6
 """The largest correlation; above it source and target determine each other."""
@@ -25,7 +26,6 @@ CORRELATION_LIMIT = 1 - 1e-6
 RIDGE = 1e-5
 """The penalty of the regression on the observation, in units of its normalised entries."""
 
-Slope = Literal["marginal", "conditional"]
 
 _SECOND = ("source_variance", "target_variance", "covariance")
 

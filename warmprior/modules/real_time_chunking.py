@@ -5,22 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers, given
+from warmprior.options.guidance import GuidanceOptions, Schedule
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
-SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
+SCHEDULES: dict[Schedule, Callable[[Tensor], Tensor]] = {
     "exp": lambda linear: linear * torch.expm1(linear) / (math.e - 1),
     "linear": lambda linear: linear,
 }
 """Schedules of the weight after the delay, by name; each is a function of a weight that falls linearly."""
-
-Schedule = Literal["exp", "linear"]
 
 
 def spliced(chunk: Tensor, forecast: Tensor, delay: Tensor) -> Tensor:
@@ -33,7 +30,7 @@ def spliced(chunk: Tensor, forecast: Tensor, delay: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class RealTimeChunking:
+class RealTimeChunking(GuidanceOptions):
     r"""The guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
 
     While a chunk is computed, the old one is executed for ``d`` more control steps (the delay), and the new
@@ -50,15 +47,7 @@ class RealTimeChunking:
     (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the first ``d`` positions, at which the old
     chunk is executed, then falls as ``schedule`` says, and is 0 from ``horizon`` on.
 
-    Args:
-        horizon: first position without guidance (LeRobot's execution_horizon, the official code's
-            prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
-        schedule: "exp" (the official default) or "linear" (LeRobot's).
-        max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
-        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and
-            takes 0.6 of the time, but is no longer exact in the Gaussian case.
-        sigma: the source's standard deviation in the weight; by default that of the policy's source. 1 gives
-            the published weight.
+    Its arguments are those of :class:`~warmprior.options.guidance.GuidanceOptions`.
 
     Raises:
         ValueError: if the schedule is unknown, or a number is out of range.
@@ -72,18 +61,6 @@ class RealTimeChunking:
         >>> rtc.guidance_weight(torch.tensor([0.0, 0.5, 0.75])).tolist()
         [5.0, 2.0, 3.33...]
     """
-
-    horizon: int | None = None
-    schedule: Schedule = "exp"
-    max_guidance_weight: float = 5.0
-    jacobian: bool = True
-    sigma: float | None = None
-
-    def __post_init__(self) -> None:
-        check_choice("schedule", self.schedule, SCHEDULES)
-        check_whole_numbers(**given(horizon=self.horizon))
-        check_positive(max_guidance_weight=self.max_guidance_weight)
-        check_not_negative(**given(sigma=self.sigma))
 
     def check_reach(self, delay: int, forecast_steps: int) -> None:
         """Raise ValueError if the delay exceeds the horizon, or the steps that the old chunk covers."""

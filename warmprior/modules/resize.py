@@ -2,30 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 from torch import Tensor, uint8
 from torch.nn.functional import interpolate, pad
 
-Resize = Literal["squeeze", "pad"]
-
-IMAGE_SIZE = 84
-"""The default side of images in pixels, as in the paper (Table 3)."""
-
-
-@dataclass(frozen=True)
-class Resizing:
-    """The options of images' size.
-
-    Attributes:
-        image_size: side in pixels to which images are resized; by default squares of one size stay as they
-            are, and others are resized to 84.
-        resize: how images that are not square become so: squeezed, or padded with black.
-    """
-
-    image_size: int | None = None
-    resize: Resize = "squeeze"
+from warmprior.options.data import Resize
 
 
 def resized(images: Tensor, size: tuple[int, int], resize: Resize = "squeeze") -> Tensor:

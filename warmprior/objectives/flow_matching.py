@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, cast, get_args
+from typing import Any, ClassVar, cast, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,6 +21,7 @@ from warmprior.modules.generator import Drawing
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import device_of, network_observation, velocity_field
 from warmprior.objectives.times import TIMES, Times
+from warmprior.options.training import Objective, Weighting
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
@@ -29,11 +30,6 @@ The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes
 may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
 ``times``, a path and training times that the loss uses instead of its own.
 """
-
-Objective = Literal["velocity", "l1"]
-
-Weighting = Literal["velocity", "standardised"]
-
 
 FAR_OUTSIDE = 10.0
 """A size that no normalised action has; those of other demonstrations reach a little past 1."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,8 +12,6 @@ from warmprior.checks import given
 
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """A function that draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
-
-TimesName = Literal["uniform", "u-shaped", "start"]
 
 STEEPNESS = 4.0
 """The constant ``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""

@@ -1,6 +1,6 @@
 """Reinforcement learning in the source space of a frozen policy."""
 
-from warmprior.rl.agent import PriorSpaceConfig
+from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor, has_anchor
 from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -15,16 +14,9 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
-from warmprior.checks import (
-    check_between,
-    check_choice,
-    check_finite,
-    check_finite_numbers,
-    check_positive,
-    check_whole_numbers,
-    given,
-)
+from warmprior.checks import check_finite
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
@@ -32,87 +24,9 @@ from warmprior.rl.networks import make_prior_space_actor, make_prior_space_criti
 from warmprior.saving.checkpoint import named, restore_optimizer, select, snapshot_optimizer
 
 
-@dataclass(frozen=True)
-class PriorSpaceConfig:
-    """The recipe of prior-space reinforcement learning.
-
-    The defaults are DSRL's for Lift, Can and Square, around a WarmPrior mean.
-
-    Attributes:
-        algorithm: ``"dsrl-na"`` or ``"dsrl-sac"``.
-        environment_steps: control steps to collect, including the warm-up.
-        warmup_steps: control steps before any update, with residuals drawn from the prior and clipped to the
-            box.
-        delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
-        nfe: network evaluations per decoded chunk.
-        updates: updates per vector step (one decision of every parallel environment).
-        noise_critic_steps: distillation updates per vector step, DSRL-NA only.
-        batch_size: transitions per update.
-        learning_rate: learning rate of actor, critics and temperature.
-        tau: rate of the target critics' averaging.
-        gamma: discount per decision.
-        hidden_dim: width of actor and critics.
-        num_layers: number of hidden layers of actor and critics.
-        backup_entropy: include the entropy in the targets of DSRL-NA's critic; those of SAC always do.
-        alpha_init: initial temperature, 1 in DSRL. If success ends the episode, choose less than
-            ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
-            more than success until the temperature has fallen.
-        target_entropy: target of the entropy, in units of the box.
-        reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
-        evaluate_every: control steps between evaluations (and saves).
-        evaluation_episodes: episodes per evaluation of the greedy agent.
-        seed: seed of all random draws.
-
-    Raises:
-        ValueError: if an option is unknown or out of range.
-
-    Examples:
-        >>> from warmprior.rl import PriorSpaceConfig
-        >>> config = PriorSpaceConfig(algorithm="dsrl-sac", delta=1.5, hidden_dim=128)
-        >>> config.environment_steps, config.gamma
-        (1000000, 0.99)
-    """
-
-    algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"
-    environment_steps: int = 1_000_000
-    warmup_steps: int = 24_000
-    delta: float | None = None
-    nfe: int = 1
-    updates: int = 20
-    noise_critic_steps: int = 10
-    batch_size: int = 256
-    learning_rate: float = 3e-4
-    tau: float = 0.005
-    gamma: float = 0.99
-    hidden_dim: int = 2048
-    num_layers: int = 3
-    backup_entropy: bool = True
-    alpha_init: float = 1.0
-    target_entropy: float = 0.0
-    reward_offset: float = 1.0
-    evaluate_every: int = 20_000
-    evaluation_episodes: int = 200
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_choice("algorithm", self.algorithm, ("dsrl-na", "dsrl-sac"))
-        if self.algorithm == "dsrl-sac" and not self.backup_entropy:
-            raise ValueError("dsrl-sac has backup_entropy=True; leave it out")
-        check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)
-        check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
-        check_positive(gamma=self.gamma, tau=self.tau, **given(delta=self.delta))
-        check_between(0, 1, gamma=self.gamma, tau=self.tau)
-        names = ["environment_steps", "warmup_steps", "nfe", "updates", "noise_critic_steps", "batch_size"]
-        names += ["hidden_dim", "num_layers", "evaluate_every", "evaluation_episodes"]
-        check_whole_numbers(**{name: getattr(self, name) for name in names})
-        if self.warmup_steps > self.environment_steps:
-            raise ValueError(
-                f"warmup_steps ({self.warmup_steps}) exceed environment_steps ({self.environment_steps})"
-            )
-
-    def delta_for(self, actor: WarmPriorActor) -> float:
-        """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
-        return self.delta or (0.5 if has_anchor(actor) else 1.5)
+def delta_of(config: PriorSpaceConfig, actor: WarmPriorActor) -> float:
+    """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
+    return config.delta or (0.5 if has_anchor(actor) else 1.5)
 
 
 class WarmUpSwitch(TensorDictModuleBase):
@@ -144,7 +58,7 @@ class PriorSpaceAgent:
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
         self.config = config
         self.device = next(actor.parameters()).device
-        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=config.delta_for(actor))
+        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=delta_of(config, actor))
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
         drawn: Literal["clipped"] | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)

@@ -16,7 +16,7 @@ from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.rl.agent import PriorSpaceConfig
+from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
@@ -124,7 +124,7 @@ def improve_policy(
     """
     # Only here, because the package is imported without its environments.
     from warmprior.envs.description import environment_parts, is_registered
-    from warmprior.envs.tasks import EVALUATION_SEED
+    from warmprior.options.evaluation import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     check_improvable(policy)

@@ -25,7 +25,8 @@ from warmprior.evaluation.parallel import transforms_of, watched
 from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig, WarmUpSwitch
+from warmprior.options.agent import PriorSpaceConfig
+from warmprior.rl.agent import PriorSpaceAgent, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.improved import improved_policy
 from warmprior.saving.checkpoint import (

@@ -21,8 +21,8 @@ from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.gymnasium import registered_env
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION
+from warmprior.options.data import Actions
 from warmprior.tasks.task import Play
-from warmprior.transforms.absolute_actions import Actions
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Behaviour cloning, and the options of its networks and recipes."""
 
 from warmprior.modules.schedule import warmup_cosine
+from warmprior.options.training import NetworkOptions, TrainingConfig
 from warmprior.training.cloning import BehaviourCloning
+from warmprior.training.networks import make_network
 from warmprior.training.optim import ema_of
-from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.train import precondition, train_policy
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "NetworkOptions",
     "TrainingConfig",
     "ema_of",
+    "make_network",
     "precondition",
     "train_policy",
     "warmup_cosine",

@@ -21,6 +21,7 @@ from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of, uncompiled
 from warmprior.objectives.flow_matching import Coupling
+from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     RunState,
     fixed_identity,
@@ -32,7 +33,6 @@ from warmprior.saving.checkpoint import (
 )
 from warmprior.saving.policies import check_saveable, load_policy, policy_config, save_policy
 from warmprior.training.gradient_step import GradientStep
-from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
 from warmprior.transforms.window import window_replay_buffer
 

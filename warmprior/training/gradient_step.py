@@ -17,6 +17,7 @@ from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
+from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     module_tensors,
     named,
@@ -26,7 +27,6 @@ from warmprior.saving.checkpoint import (
     snapshot_optimizer,
 )
 from warmprior.training.optim import ema_of, make_optimizer
-from warmprior.training.options import TrainingConfig
 
 
 class GradientStep:

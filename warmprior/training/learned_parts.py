@@ -18,6 +18,7 @@ from warmprior.io.files import exclusive
 from warmprior.modules.actor import StartPoint
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
+from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     check_identity,
     load_state,
@@ -28,7 +29,6 @@ from warmprior.saving.checkpoint import (
     save_state,
 )
 from warmprior.saving.policies import NoLargerThan
-from warmprior.training.options import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer, without_images
 
 SHARE = 0.25

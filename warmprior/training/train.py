@@ -22,15 +22,16 @@ from warmprior.io.distributed import rank, wait_for_leader, world_size
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PreconditionedNetwork, Slope, SourceMoments
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import RestingAction, RestingTrend
 from warmprior.objectives.flow_matching import Coupling
+from warmprior.options.training import NetworkOptions, Slope, TrainingConfig
 from warmprior.saving.policies import load_policy
 from warmprior.tasks.task import Task
 from warmprior.training.cloning import BehaviourCloning
 from warmprior.training.learned_parts import learned, learns_first
-from warmprior.training.options import NetworkOptions, TrainingConfig
+from warmprior.training.networks import make_network
 from warmprior.training.placement import placed
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_replay_buffer, without_images
@@ -55,7 +56,9 @@ def new_policy(
     if see_history:
         observation_dim += HistoryObservation.width(prior.history_length, action_dim)
     torch.manual_seed(training.seed)
-    velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images, task.resize)
+    velocity = make_network(
+        network, action_dim, observation_dim, prior.prediction_length, task.images, task.resize
+    )
     if network.precondition:
         velocity = precondition(
             velocity,
@@ -120,7 +123,7 @@ def train_policy(
         images: images of policies, see :class:`Task`.
         nfe: network evaluations per chunk, saved with the policy; see :class:`~warmprior.Sampling`.
         network: options of the velocity network.
-        training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
+        training: the recipe; :data:`~warmprior.options.training.PAPER` is the paper's.
         start: the point from which integration starts; the source sample by default.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`; in order by default.
         see_history: True if the network sees the last actions.

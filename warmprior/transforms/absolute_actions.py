@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -14,9 +13,6 @@ from warmprior import keys
 from warmprior.checks import check_keys, check_shape
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
 from warmprior.transforms.inner_step import EnvTransform, observed
-
-Actions = Literal["delta", "absolute"]
-"""Actions of a policy: pose deltas as robosuite's environments take them, or the poses that they target."""
 
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
 _REACH = 2.0  # metres, the bound of positions in the action spec; it only limits random samples

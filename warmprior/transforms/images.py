@@ -14,7 +14,8 @@ from warmprior import keys
 from warmprior.checks import check_distinct, check_keys, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation, precision_of
-from warmprior.modules.resize import IMAGE_SIZE, Resize, resized
+from warmprior.modules.resize import resized
+from warmprior.options.data import IMAGE_SIZE, Resize
 from warmprior.transforms.inner_step import EnvTransform
 
 _SIM_STATE = ": build the environment with sim_state=True"

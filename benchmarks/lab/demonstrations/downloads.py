@@ -6,10 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.formats.hdf5 import open_robomimic
-from warmprior.data.index import DatasetError
-from warmprior.envs.mimicgen import is_mimicgen
-from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
@@ -60,6 +56,9 @@ def download_robomimic(
             ...
         ValueError: tool_hang has no official 'mh' data; it has: ph
     """
+    from warmprior.envs.mimicgen import is_mimicgen
+    from warmprior.envs.tasks import TASKS
+
     official = OFFICIAL
     if task not in official:
         raise ValueError(f"no official data for task {task!r}; choose one of {', '.join(official)}")
@@ -75,6 +74,9 @@ def download_robomimic(
 
 def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
     """Download and check a file from the first repository that delivers it."""
+    from warmprior.data.formats.hdf5 import open_robomimic
+    from warmprior.data.index import DatasetError
+
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")
     failures: list[str] = []

@@ -20,7 +20,7 @@ from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, digest_of, exclusive, file_digest, write_atomic
 from warmprior.io.machine import available_memory
-from warmprior.modules.resize import IMAGE_SIZE
+from warmprior.options.data import IMAGE_SIZE
 
 
 def render_demonstrations(

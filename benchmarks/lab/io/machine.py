@@ -7,8 +7,6 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import torch
-
 from warmprior import checks
 from warmprior.io.distributed import launched
 
@@ -17,6 +15,8 @@ PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco"
 
 def facts_of_machine(**more: Any) -> dict[str, Any]:
     """Return versions and hardware, which files of results keep."""
+    import torch
+
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -31,6 +31,8 @@ def facts_of_machine(**more: Any) -> dict[str, Any]:
 
 def check_device(device: str) -> None:
     """Raise ValueError if a device, such as ``"cuda"``, is missing for a process or does not work."""
+    import torch
+
     if device.startswith("cuda") and launched():
         local, devices = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
         if device != "cuda":

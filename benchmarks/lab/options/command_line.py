@@ -15,7 +15,7 @@ from typing import Any
 
 import tyro
 
-from lab.demonstrations.tasks import resolved_place
+from lab.demonstrations.data_options import resolved_place
 from lab.io.files import ERRORS
 from lab.io.machine import check_device, facts_of_machine
 from lab.io.workers import at_most
@@ -24,6 +24,7 @@ from lab.options.presets import adapted
 from lab.options.stored_options import check_same, check_typed, of_run, recorded, stored_options
 from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import check_writable, exclusive, write_atomic
+from warmprior.io.option_help import registry
 from warmprior.io.script import read_command_line, run_script
 
 
@@ -88,7 +89,9 @@ def read[O](default: O, argv: Sequence[str], description: str | None) -> O:
     description = re.sub(r"^(?=python |torchrun )", "$ ", description or "", flags=re.M)
     kind: Any = type(default)
     # Errors of our dataclasses are reported in one line like all others.
-    return read_command_line(partial(tyro.cli, kind, default=default, args=argv, description=description))
+    return read_command_line(
+        partial(tyro.cli, kind, default=default, args=argv, description=description, registry=registry)
+    )
 
 
 def output_folder(options: Options, study: str) -> Path:

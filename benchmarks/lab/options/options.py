@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
 import tyro
 
-from lab.demonstrations.tasks import (
+from lab.demonstrations.data_options import (
     DataOptions,
     check_counts,
     check_network,
@@ -22,12 +21,12 @@ from lab.demonstrations.tasks import (
     is_simulated,
     without_images,
 )
-from lab.methods.methods import Method
-from warmprior.data import open_demonstrations
-from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import check_batch, launched
-from warmprior.modules.ode import Sampling
-from warmprior.training import NetworkOptions, TrainingConfig
+from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.training import NetworkOptions, TrainingConfig
+
+if TYPE_CHECKING:
+    from lab.methods.methods import Method
 
 STARTS = 10_000
 """The number of simulator seeds that each training seed has for its evaluation episodes."""
@@ -59,6 +58,8 @@ class Sources:
 
     def methods(self) -> list[Method]:
         """Return all methods, chunk length by chunk length, without duplicates."""
+        from lab.methods.methods import Method
+
         methods = [
             Method(text, chunk, sigma)
             for chunk in sorted(set(self.chunk))
@@ -85,6 +86,11 @@ class Evaluation:
         check_given(self, "nfe", "temperature")
         if self.episodes > STARTS:
             raise ValueError(f"--episodes must be at most {STARTS:,}, got {self.episodes}")
+
+    def check(self) -> None:
+        """Raise ValueError for temperatures or a grid that policies do not take."""
+        from warmprior.modules.ode import Sampling
+
         for temperature in self.temperature:
             Sampling(temperature=temperature, grid=self.grid)
 
@@ -147,17 +153,22 @@ class Options:
     """All options of a comparison of sources."""
 
     data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
-    network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
-    training: Annotated[TrainingConfig, Flat] = field(default_factory=TrainingConfig)
     sources: Annotated[Sources, Flat] = field(default_factory=Sources)
+    training: Annotated[TrainingConfig, Flat] = field(default_factory=TrainingConfig)
     evaluation: Annotated[Evaluation, Flat] = field(default_factory=Evaluation)
     run: Annotated[Run, Flat] = field(default_factory=Run)
+    network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
 
     @property
     def name(self) -> str:
         """Return the name of the tasks, for folders."""
         file = self.data.dataset
-        tasks = self.data.task or ("square" if file is None else open_demonstrations(file).title,)
+        tasks = self.data.task
+        if not tasks and file is not None:
+            from warmprior.data import open_demonstrations
+
+            tasks = (open_demonstrations(file).title,)
+        tasks = tasks or ("square",)
         space = [] if self.data.actions == "delta" else [self.data.actions]
         observations = [] if self.data.obs == "state" else [self.data.obs]
         names = [task.replace(":", "-") for task in tasks]
@@ -171,12 +182,17 @@ class Options:
         return [self.training]
 
     def check(self) -> None:
+        import torch
+
+        from warmprior.training import make_network
+
         self.data.check()
+        self.evaluation.check()
         check_network(self.network, self.data)
         check_batch(self.training.batch_size)
         try:
             with torch.device("meta"):  # nothing is computed
-                without_images(self.network).make(1, 1, 2)
+                make_network(without_images(self.network), 1, 1, 2)
         except ValueError as error:
             raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):

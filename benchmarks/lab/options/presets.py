@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lab.demonstrations.tasks import DataOptions, is_simulated
+from lab.demonstrations.data_options import DataOptions, is_simulated
 from lab.options.options import Evaluation, Options, with_parts
-from warmprior.modules import imagenet_weights
-from warmprior.training import NetworkOptions, TrainingConfig
-from warmprior.training.options import PAPER, PRETRAINED
+from warmprior.options.training import PAPER, PRETRAINED, NetworkOptions, TrainingConfig
 
 PRESETS: dict[str, Options] = {
     # A first table: one seed, a small network and a short training, in a setting where the source matters.
@@ -81,6 +79,8 @@ def adapted[O: Options](preset: O, typed: Options) -> O:
             changes["data"] |= {"task": ("lift",), "demonstrations": (100,)}
         preset = with_parts(preset, **changes)
     if preset.network.encoder == typed.network.encoder == PRETRAINED:
+        from warmprior.modules.encoder import imagenet_weights
+
         try:
             imagenet_weights()
         except (OSError, ImportError) as error:

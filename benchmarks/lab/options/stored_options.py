@@ -10,9 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from lab.demonstrations.tasks import (
-    resolved_place,
-)
+from lab.demonstrations.data_options import resolved_place
 from lab.options.options import Options, with_parts
 from warmprior.io.files import read_json
 

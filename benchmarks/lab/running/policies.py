@@ -24,15 +24,8 @@ from filelock import FileLock
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 
-from lab.demonstrations.tasks import (
-    DataOptions,
-    load_task,
-    longest_of,
-    space_of,
-    task_places,
-    title_of,
-    without_images,
-)
+from lab.demonstrations.data_options import DataOptions, without_images
+from lab.demonstrations.tasks import load_task, longest_of, space_of, task_places, title_of
 from lab.measures.source_errors import mean_revision
 from lab.methods.methods import Method
 from lab.options.options import Evaluation, Options, Run, with_parts

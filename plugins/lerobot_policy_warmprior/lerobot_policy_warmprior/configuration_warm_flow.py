@@ -18,7 +18,7 @@ from warmprior.checks import check_between
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
-from warmprior.modules.resize import IMAGE_SIZE
+from warmprior.options.data import IMAGE_SIZE
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 

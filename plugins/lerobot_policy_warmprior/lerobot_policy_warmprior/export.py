@@ -22,7 +22,7 @@ from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post
 from warmprior import PreconditionedNetwork, VelocityNetwork, keys
 from warmprior.envs import TASKS
 from warmprior.envs.description import environment_name
-from warmprior.io.script import run_script
+from warmprior.io.script import read_command_line, run_script
 from warmprior.saving.policies import load_policy
 
 _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.state": FeatureType.STATE}
@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="lerobot_policy_warmprior.export", description=__doc__)
     parser.add_argument("folder", type=Path, help="folder of the saved policy")
     parser.add_argument("out", type=Path, help="folder to write, which must not exist")
-    args = parser.parse_args(argv)
+    args = read_command_line(lambda: parser.parse_args(argv))
     print(export_policy(args.folder, args.out))
     return 0
 

@@ -25,8 +25,9 @@ from lab.io.files import cache_folder
 from lab.io.workers import available_cores, working
 from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
-from warmprior.envs.tasks import EVALUATION_SEED, get_task
+from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
+from warmprior.options.evaluation import EVALUATION_SEED
 
 #: Part of every cached file's name; raised when the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
@@ -52,7 +53,7 @@ def generate_demonstrations(
     Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
     kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
     official files. The content does not depend on the number of workers. All seeds are smaller
-    than :data:`~warmprior.envs.tasks.EVALUATION_SEED`.
+    than :data:`~warmprior.options.evaluation.EVALUATION_SEED`.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``stack`` or ``transport``.

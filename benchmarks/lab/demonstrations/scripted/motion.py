@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lab.demonstrations.scripted.operators import Demonstrator
-from warmprior.envs.control_loop import StepLoop
+
+if TYPE_CHECKING:
+    from warmprior.envs.control_loop import StepLoop
 
 # Gripper pointing down, fingers opening along the world's y axis.
 _HOME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -7,6 +7,7 @@ to four times.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,10 +34,14 @@ from lab.demonstrations.scripted.motion import (
     yaw_of,
 )
 from lab.demonstrations.scripted.operators import Demonstrator
-from warmprior.envs.control_loop import StepLoop
 
-_Attempt = Callable[[StepLoop, Demonstrator], Plan]
-_Expert = Callable[[StepLoop, Demonstrator], list[Plan]]  # a plan per arm, for a loop that was just reset
+if TYPE_CHECKING:
+    from warmprior.envs.control_loop import StepLoop
+
+type _Attempt = Callable[[StepLoop, Demonstrator], Plan]
+type _Expert = Callable[
+    [StepLoop, Demonstrator], list[Plan]
+]  # a plan per arm, for a loop that was just reset
 _ATTEMPTS = 4
 _PEG = np.array([0.23, 0.1])
 _NUT = "SquareNut_main"

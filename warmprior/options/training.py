@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -16,20 +14,12 @@ from warmprior.checks import (
     check_whole_numbers,
     given,
 )
-from warmprior.modules import (
-    AdaLNTransformer,
-    ChiTransformer,
-    ImageEncoder,
-    PlainMLP,
-    VelocityMLP,
-    VelocityNetwork,
-    VisionNetwork,
-)
-from warmprior.modules.encoder import load_imagenet
-from warmprior.modules.preconditioning import Slope
-from warmprior.modules.resize import Resize
-from warmprior.objectives.flow_matching import Objective, Weighting
-from warmprior.objectives.times import TimesName
+
+Network = Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"]
+
+TRANSFORMERS = ("chi_transformer", "adaln_transformer")
+
+Slope = Literal["marginal", "conditional"]
 
 Encoder = Literal["resnet18-imagenet", "resnet18", "small"]
 
@@ -37,13 +27,6 @@ PRETRAINED = "resnet18-imagenet"
 
 OF_IMAGES = ("encoder", "crop_size", "share_encoder")
 """The options that have no effect without images."""
-
-_NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
-    "mlp": (VelocityMLP, "hidden_dim"),
-    "plain_mlp": (PlainMLP, "hidden_dim"),
-    "chi_transformer": (ChiTransformer, "embedding_dim"),
-    "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
-}
 
 
 @dataclass(frozen=True)
@@ -69,15 +52,12 @@ class NetworkOptions:
         share_encoder: use one encoder for all cameras.
 
     Examples:
-        >>> import torch
         >>> from warmprior.training import NetworkOptions
-        >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
-        >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
-        >>> network(torch.zeros(1), torch.zeros(1, 8, 7), torch.zeros(1, options.observation_steps, 23)).shape
-        torch.Size([1, 8, 7])
+        >>> NetworkOptions(network="chi_transformer", hidden_dim=48).observation_steps
+        2
     """
 
-    network: Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"] = "mlp"
+    network: Network = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     slope: Slope = "marginal"
@@ -91,60 +71,31 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         check_whole_numbers(observation_steps=self.observation_steps)
         check_whole_numbers(**given(hidden_dim=self.hidden_dim, crop_size=self.crop_size))
-        check_choice("network", self.network, _NETWORKS)
+        check_choice("network", self.network, get_args(Network))
         check_choice("encoder", self.encoder, get_args(Encoder))
         check_choice("slope", self.slope, get_args(Slope))
         if self.slope != "marginal" and not self.precondition:
             raise ValueError(f"slope = {self.slope!r} belongs to a preconditioned network")
         check_whole_numbers(0, **given(observation_layers=self.observation_layers))
         check_positive(**given(time_frequency=self.time_frequency))
-        for name in self._of_transformers():
-            able = [key for key, (kind, _) in _NETWORKS.items() if name in inspect.signature(kind).parameters]
-            if self.network not in able:
+        for name in self.of_transformers:
+            if self.network not in TRANSFORMERS:
                 raise ValueError(
-                    f"{name} belongs to {' and '.join(able)}: leave it None with the network {self.network}"
+                    f"{name} belongs to {' and '.join(TRANSFORMERS)}: leave it None with the network "
+                    f"{self.network}"
                 )
 
-    def _of_transformers(self) -> dict[str, Any]:
+    @property
+    def of_transformers(self) -> dict[str, Any]:
+        """Return the options that transformers alone have, if they are given."""
         return given(observation_layers=self.observation_layers, time_frequency=self.time_frequency)
 
-    def make(
-        self,
-        action_dim: int,
-        observation_dim: int,
-        prediction_length: int,
-        images: Mapping[str, int] | None = None,
-        resize: Resize = "squeeze",
-    ) -> VelocityNetwork:
-        """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
-        With images, ``d_o`` is the width of the vector, and ``resize`` how the images got their size. Raises
-        ValueError for options of images without any.
-        """
-        kind, width = _NETWORKS[self.network]
-        options = self._of_transformers()
-        if self.hidden_dim is not None:
-            options[width] = self.hidden_dim
-        encoder = None
-        unused = [name for name in OF_IMAGES if getattr(self, name) != getattr(NetworkOptions, name)]
-        if unused and not images:
-            raise ValueError(f"{', '.join(unused)} would change nothing without image keys")
-        if images:
-            encoder = ImageEncoder(
-                list(images),
-                observation_dim,
-                image_size=next(iter(images.values())),
-                crop_size=self.crop_size,
-                backbone="small" if self.encoder == "small" else "resnet18",
-                share=self.share_encoder,
-                resize=resize,
-            )
-            if self.encoder == PRETRAINED:
-                load_imagenet(encoder)
-            observation_dim = encoder.observation_dim
-        network = kind(action_dim, observation_dim, prediction_length, self.observation_steps, **options)
-        return network if encoder is None else VisionNetwork(encoder, network)
+TimesName = Literal["uniform", "u-shaped", "start"]
 
+Objective = Literal["velocity", "l1"]
+
+Weighting = Literal["velocity", "standardised"]
 
 Precision = Literal["float32", "bf16"]
 

@@ -1,0 +1,91 @@
+"""Help is printed without PyTorch, whose import takes seconds; it says what happens instead of a None."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OF_TORCH = ("peers", "throughput")
+"""Scripts that measure PyTorch, and import it before they read their options."""
+
+SCRIPTS = [path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem not in OF_TORCH]
+OF_DEMONSTRATIONS = ["generate", "download", "render"]
+COMMANDS = ["info", "push", "evaluate", "train", "improve", "export", "convert", "observe"]
+HELP = """
+import contextlib, importlib, io, json, sys
+
+class Without:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "tensordict", "torchrl"):
+            raise ImportError(f"{name} is imported")
+
+sys.meta_path.insert(0, Without())
+texts = {}
+for module, *argv in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        try:
+            importlib.import_module(module).main([*argv, "--help"])
+        except SystemExit as stop:
+            assert not stop.code, (module, stop.code)
+    texts[" ".join([module, *argv])] = said.getvalue()
+with contextlib.redirect_stderr(io.StringIO()) as said:
+    try:
+        importlib.import_module("card").main(["a run", "a folder"])
+    except ImportError as error:
+        said.write(str(error))
+texts["start"] = said.getvalue()
+json.dump(texts, sys.stdout)
+"""
+
+
+@pytest.fixture(scope="module")
+def helps():
+    """The help of every command, printed by one process that cannot import PyTorch."""
+    commands = [["warmprior.__main__"], *(["warmprior.__main__", name] for name in COMMANDS)]
+    commands += [*([name] for name in SCRIPTS), *(["demonstrations", name] for name in OF_DEMONSTRATIONS)]
+    place = os.pathsep.join(map(str, (ROOT, ROOT / "benchmarks")))
+    environment = {**os.environ, "PYTHONPATH": place, "COLUMNS": "80"}
+    command = [sys.executable, "-c", HELP, json.dumps(commands)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_help_names_options_and_no_none(helps):
+    assert [name for name, text in helps.items() if "usage: " not in text] == ["start"]
+    found = {name: re.findall(r".*\bNone\b.*|.*\(default: \).*", text) for name, text in helps.items()}
+    assert not {name: lines for name, lines in found.items() if lines}
+
+
+def test_what_takes_seconds_is_said_before_it_begins(helps):
+    """All scripts read their options by the same function."""
+    assert helps["start"].splitlines()[0] == "importing PyTorch"
+    assert "torch is imported" in helps["start"]
+
+
+def groups(text):
+    """The titles of the boxes, whose frames depend on the terminal."""
+    return re.findall(r"^\W*?(?:(\w+) )?options \W*$", text, re.M)
+
+
+def test_what_everyone_sets_comes_first(helps):
+    order = ["", "data", "source", "training", "evaluation", "run", "network"]
+    assert groups(helps["warmprior.__main__ train"]) == order
+    order[2] = "sources"
+    for name in ("robomimic", "pusht", "joint_targets", "mimicgen_tasks", "chunking", "navigation1d"):
+        assert groups(helps[name]) == order, name
+
+
+def test_a_reader_who_has_seen_enough_is_no_error():
+    """The pipe is closed before anything is written to it."""
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "warmprior", "train", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -1,0 +1,28 @@
+"""Options of the data that policies see and give: images' size, and the kind of actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Actions = Literal["delta", "absolute"]
+"""Actions of a policy: pose deltas as robosuite's environments take them, or the poses that they target."""
+
+Resize = Literal["squeeze", "pad"]
+
+IMAGE_SIZE = 84
+"""The default side of images in pixels, as in the paper (Table 3)."""
+
+
+@dataclass(frozen=True)
+class Resizing:
+    """The options of images' size.
+
+    Attributes:
+        image_size: side in pixels to which images are resized; by default squares of one size stay as they
+            are, and others are resized to 84.
+        resize: how images that are not square become so: squeezed, or padded with black.
+    """
+
+    image_size: int | None = None
+    resize: Resize = "squeeze"
