@@ -120,8 +120,8 @@ class RobosuiteEnv(EnvBase):
             horizon = spec.horizon(style)
         super().__init__(device=device)
         self.task = spec
-        #: The camera that :meth:`render_frame` shows by default: the task's first, or ``"agentview"``.
-        self.camera = "agentview" if spec is None else spec.cameras[0]
+        #: The camera that :meth:`render_frame` shows by default; robosuite's ``"frontview"`` has the whole arm.
+        self.camera = "frontview"
         self._env = env if env_args is None else make_simulator(env_args)
         if control_loop is None:
             control_loop = "lean" if is_plain(self._env) else "robosuite"
