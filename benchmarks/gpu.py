@@ -34,8 +34,8 @@ from warmprior.checks import check_choice, check_positive
 from warmprior.io.files import check_writable, write_atomic
 
 if TYPE_CHECKING:
-    from lab.measures.timing import Clock
     from lab.running.policies import Cell, Policy
+    from lab.speed.timing import Clock
 
 ROOT = Path(__file__).parents[1]
 PROBE, TINY_PROBE = 300, 6
@@ -131,25 +131,24 @@ def tests(o: GpuOptions, seconds: float) -> dict[str, Any]:
 
 
 def clock(o: GpuOptions) -> Clock:
-    from lab.measures.timing import Clock
+    from lab.speed.timing import Clock
 
     return Clock(1 if o.smallest else 11, tqdm(desc="rounds", leave=False, disable=None))
 
 
 def ratios(o: GpuOptions, seconds: float) -> dict[str, Any]:
-    """Measure the library over bare torch: `cuda_*_over_*` of throughput.py."""
-    import throughput
+    """Measure the library over bare torch: as throughput.py does."""
+    from lab.speed.training import cuda_train_step_over_network
 
-    names = [name for name in throughput.FIGURES if name.startswith("cuda_") and "_over_" in name]
-    return {name: throughput.FIGURES[name][0](clock(o)) for name in names}
+    return {"cuda_train_step_over_network": cuda_train_step_over_network(clock(o))}
 
 
 def speed(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Measure training steps per second of the paper's transformer: `cuda_steps_per_second`."""
-    import throughput
+    from lab.speed.training import small_network, steps_per_second
 
-    tiny: dict[str, Any] = {"network": throughput.small_network, "batch": 4} if o.smallest else {}
-    return throughput.steps_per_second(clock(o), o.device, **tiny) or {}
+    tiny: dict[str, Any] = {"network": small_network, "batch": 4} if o.smallest else {}
+    return steps_per_second(clock(o), o.device, **tiny) or {}
 
 
 def train_for(o: GpuOptions, seconds: float, obs: str) -> tuple[Options, list[Policy]]:

@@ -10,10 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-OF_TORCH = ("peers", "throughput")
-"""Scripts that measure PyTorch, and import it before they read their options."""
-
-SCRIPTS = [path.stem for path in (ROOT / "benchmarks").glob("*.py") if path.stem not in OF_TORCH]
+SCRIPTS = [path.stem for path in (ROOT / "benchmarks").glob("*.py")]
 OF_DEMONSTRATIONS = ["generate", "download", "render"]
 COMMANDS = ["info", "push", "evaluate", "train", "improve", "export", "convert", "observe"]
 HELP = """

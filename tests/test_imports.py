@@ -115,7 +115,7 @@ ROOMS = [
 ]
 """Each may import those before it alone."""
 
-ROOMS_OF_THE_LAB = ["io", "demonstrations", "methods", "options", "measures", "reporting", "running"]
+ROOMS_OF_THE_LAB = ["io", "demonstrations", "methods", "options", "measures", "speed", "reporting", "running"]
 """The same holds here."""
 
 

@@ -12,12 +12,12 @@ import torch
 from torch import nn
 
 from lab.demonstrations.tasks import navigation_task
-from lab.measures import timing
 from lab.options.command_line import parse
 from lab.options.options import with_parts
 from lab.options.presets import IMAGES, PRESETS
 from lab.options.stored_options import recorded
 from lab.reporting import paper
+from lab.speed import timing
 from tests import paper_facts as facts
 from warmprior import (
     ChiTransformer,
@@ -219,9 +219,10 @@ def test_tasks_have_the_papers_cameras_and_widths():
 
 def test_speed_is_measured_at_the_papers_sizes():
     from peers import PEERS
-    from throughput import paper_network
 
-    widths = {PEERS["warmprior_transformer"][1], paper_network().embedding_dim}
+    from lab.speed.training import paper_network
+
+    widths = {PEERS["warmprior_transformer"][0], paper_network().embedding_dim}
     assert widths == {STATE["embedding_dim"]} and STATE["observation_steps"] == timing.TO
     assert (facts.EVALUATION["nfe"], facts.EVALUATION["chunk"]) == (timing.NFES, (timing.H,))
 

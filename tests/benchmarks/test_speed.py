@@ -9,6 +9,8 @@ import throughput
 import torch
 from tensordict import TensorDict
 
+from lab.speed.timing import PRIOR, TO, Clock, H, steps
+from lab.speed.windows import bare_ranges
 from tests.benchmarks.script_parts import refused
 from tests.errors import missing
 from warmprior import GaussianPrior, window_replay_buffer, window_transforms
@@ -16,16 +18,19 @@ from warmprior import GaussianPrior, window_replay_buffer, window_transforms
 
 @pytest.mark.parametrize("name", peers.PEERS)
 def test_peers_learn_from_the_same_windows(name):
-    make, width, packages = peers.PEERS[name]
+    width, packages = peers.PEERS[name]
     for package in packages:
         pytest.importorskip(package)
+    from lab.speed import peers as kinds
+
     torch.manual_seed(0)
+    make = getattr(kinds, name)
     assert 0.9 < make(width, "cpu").parameters / 2e7 < 1.1
     peer = make(32 if "diffusion" in name else 96, "cpu")
     weights = [p for p in peer.module.parameters() if p.requires_grad]
     before = [p.detach().clone() for p in weights]
-    batch = window_replay_buffer(peers.steps(4, 50), GaussianPrior(peers.H), batch_size=8).sample()
-    peers.training_step(peer, lambda: batch)()
+    batch = window_replay_buffer(steps(4, 50), GaussianPrior(H), batch_size=8).sample()
+    kinds.training_step(peer, lambda: batch)()
     moved = [not torch.equal(a, b) for a, b in zip(weights, before, strict=True)]
     assert sum(moved) > 0.8 * len(moved)
     # Every evaluation passes through each layer of the network once.
@@ -54,15 +59,15 @@ def test_throughput_writes_every_key(tmp_path):
     results = throughputs(tmp_path, "--only", "windows_over_torch", "preconditioning_over_network")
     found = {key for key, value in results.items() if value is not None}
     assert found == {"windows_over_torch", "preconditioning_over_network", "meta"}
-    assert results.keys() == {*throughput.FIGURES, "meta"}
+    assert results.keys() == {"meta"}.union(*throughput.FIGURES.values())
     assert min(results["windows_over_torch"].values()) > 0 and results["preconditioning_over_network"] > 0
 
 
 def test_bare_ranges_are_all_that_a_window_holds():
-    data = throughput.steps(5, 20)
-    window = window_transforms(data, throughput.PRIOR, observation_steps=throughput.TO)
+    data = steps(5, 20)
+    window = window_transforms(data, PRIOR, observation_steps=TO)
     torch.manual_seed(0)
-    bare = throughput.bare_ranges(data, 64)()
+    bare = bare_ranges(data, 64)()
     torch.manual_seed(0)
     frame = torch.randint(len(data), (64,))
     batch = window(TensorDict({"frame": frame}, [64]))
@@ -78,9 +83,9 @@ def test_rounds_are_interleaved_and_the_first_is_dropped():
 
     order = []
     calls = (lambda: order.append("a"), lambda: order.append("b"))
-    times = throughput.Clock(3, Bar()).times(*calls, before=lambda: order.append("|"))
+    times = Clock(3, Bar()).times(*calls, before=lambda: order.append("|"))
     assert "".join(order) == "|ba|ab|ba|ab" and [len(rounds) for rounds in times] == [3, 3]
-    ratio = throughput.Clock(5, Bar()).ratio(lambda: time.sleep(0.03), lambda: time.sleep(0.01))
+    ratio = Clock(5, Bar()).ratio(lambda: time.sleep(0.03), lambda: time.sleep(0.01))
     assert ratio == pytest.approx(3, rel=0.4)
 
 

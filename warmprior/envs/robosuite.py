@@ -120,7 +120,7 @@ class RobosuiteEnv(EnvBase):
             horizon = spec.horizon(style)
         super().__init__(device=device)
         self.task = spec
-        #: The camera that :meth:`render_frame` shows by default; robosuite's ``"frontview"`` has the whole arm.
+        #: The camera of :meth:`render_frame` by default; robosuite's ``"frontview"`` has the whole arm.
         self.camera = "frontview"
         self._env = env if env_args is None else make_simulator(env_args)
         if control_loop is None:

@@ -1,1 +1,1 @@
-"""This room measures policies beside their success, and has a clock and intervals."""
+"""This room measures policies beside their success, and has intervals."""

@@ -17,6 +17,7 @@ from warmprior.history import window_history
 D_O, D_A, H, TO = 23, 7, 8, 2
 PRIOR = PastPrior(H)
 NFES = (1, 3, 9)
+BATCH = 256
 
 
 class Clock:
