@@ -274,6 +274,22 @@ def test_an_option_that_cannot_be_applied_is_refused(path, tmp_path, options, na
         Task(open_demonstrations(place), **images, actions=actions, play=Play(**options))
 
 
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda path: Task(path), "open_demonstrations(place)"),
+        (lambda path: Task(open_demonstrations(path), observations="object"), "observations"),
+        (lambda path: Task(open_demonstrations(path), images="agentview_image"), "['agentview_image']"),
+        (lambda path: Play(NavigationEnv, measures=["reward"]), "measures"),
+        (lambda path: open_demonstrations(path, episodes=[0]), "episodes"),
+        (lambda path: Task(open_demonstrations(path, task={"env_name": "Door"})), "Door"),
+    ],
+)
+def test_an_argument_of_another_kind_is_named(path, call, named):
+    with raises((TypeError, ValueError), named):
+        call(path)
+
+
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 

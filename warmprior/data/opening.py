@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from warmprior.checks import check_choice
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -57,5 +59,8 @@ def open_demonstrations(
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     kind = next(kind for kind in FORMATS if str(place).startswith(kind.prefix))
+    known = [name for base in kind.__mro__[:-1] for name in signature(base).parameters]
+    for name in options:
+        check_choice(f"an option of {place}", name, sorted({*known} - {"place", "options"}))
     place = str(place).removeprefix(kind.prefix)
     return kind(place, demos=demos, mask=mask, style=style, task=task, **options)

@@ -65,7 +65,7 @@ def _robosuite(
     play: Play,
 ) -> RecordedEnvironment:
     task = demonstrations.task
-    if isinstance(task, str) and task != index.task_name:
+    if task is not None and task not in (index.task_name, env_args):
         raise ValueError(
             f"{demonstrations} holds demonstrations of {index.task_name}, not of {task}: correct the task"
         )

@@ -30,7 +30,7 @@ from warmprior.saving.checkpoint import data_digest
 from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
-if TYPE_CHECKING:  # training on steps in memory needs no reader and no simulator
+if TYPE_CHECKING:  # to import a task takes no reader
     from warmprior.data.demonstrations import Demonstrations
 
 
@@ -152,6 +152,16 @@ class Task:
         actions: Actions = "delta",
         play: Play | None = None,
     ) -> None:
+        from warmprior.data.demonstrations import Demonstrations
+
+        if not isinstance(demonstrations, Demonstrations):
+            kind = type(demonstrations).__name__
+            raise TypeError(
+                f"a task takes open_demonstrations(place) or demonstrations_of(steps), not {kind}"
+            )
+        for option, names in (("observations", observations), ("images", images)):
+            if isinstance(names, str):
+                raise TypeError(f"{option} must be a list of names, such as [{names!r}]")
         check_choice("actions", actions, get_args(Actions))
         self.play = play = play or Play()
         if play.fast_rendering and not images:

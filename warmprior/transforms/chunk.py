@@ -38,7 +38,11 @@ Measures = Mapping[str, How]
 
 
 def check_measures(measures: Measures) -> None:
-    """Raise ValueError if a measure's values are combined in an unknown way."""
+    """Raise an error if it is not said how a measure's values are combined, or an unknown way is named."""
+    if not isinstance(measures, Mapping):
+        raise TypeError(
+            f"measures must say how each is combined, as {{'reward': 'max'}} does, got {measures}"
+        )
     for key, how in measures.items():
         check_choice(f"the measure {key!r}", how, get_args(How))
 
