@@ -13,7 +13,7 @@ from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
 
 from lab.measures.statistics import chosen_elsewhere
 
-SLOPES = {"marginal": "over all data", "conditional": "given the observation"}
+SLOPES = {"marginal": "over all data", "conditional": "given the observation", "none": "no preconditioning"}
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
@@ -108,14 +108,14 @@ def slope_table(name: str) -> str:
     text = [f"| NFE | slope | {' | '.join(SOURCES[source][0] for source in names)} |"]
     text.append("|---" * (2 + len(names)) + "|")
     for nfe in sorted(rows["nfe"].unique(), reverse=True):
-        for slope, words in SLOPES.items():
+        for slope in (name for name in SLOPES if (rows["slope"] == name).any()):
             entries = []
             for source in names:
                 part = rows[(rows["nfe"] == nfe) & (rows["slope"] == slope) & (rows["source"] == source)]
                 each = [f"{100 * rate:.0f}" for rate in part.sort_values("seed")["success_rate"]]
                 one = f" ({', '.join(each)})" if len(each) > 1 else ""
                 entries.append(f"{100 * part['success_rate'].mean() + 1e-6:.0f}{one}" if each else "")
-            text.append(f"| {nfe} | {words} | {' | '.join(entries)} |")
+            text.append(f"| {nfe} | {SLOPES[slope]} | {' | '.join(entries)} |")
     return "\n".join(text) + "\n"
 
 
