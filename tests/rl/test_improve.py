@@ -36,6 +36,15 @@ def make_env(seed_offset, seed_stride):
     return ReachEnv(6)
 
 
+@pytest.mark.parametrize("solved", [0, 1])
+def test_a_policy_that_solves_nothing_is_said_to_teach_nothing(tmp_path, monkeypatch, recwarn, solved):
+    training = make_training(tmp_path)
+    counted = [SimpleNamespace(success=k < solved) for k in range(2)]
+    monkeypatch.setattr("warmprior.rl.training.evaluate", lambda *args, **options: counted)
+    training.run()
+    assert any("none of 2 episodes" in str(warning.message) for warning in recwarn) == (solved == 0)
+
+
 @pytest.mark.parametrize("prior", [PastPrior(H), GaussianPrior(H)])
 def test_the_best_agent_of_the_evaluations_is_the_policy(tmp_path, prior):
     """By hand: the evaluation with the most successes, if it has more than the frozen policy."""

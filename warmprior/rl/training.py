@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
@@ -224,6 +225,12 @@ class PriorSpaceTraining:
             if not self.curve:
                 self._evaluate(evaluation_env, "base", self.actor)
                 self._save()
+                if not self.curve[0]["successes"]:
+                    warnings.warn(
+                        f"the policy solves none of {config.evaluation_episodes} episodes: an agent learns "
+                        "from successes, so train the policy on more demonstrations, or for longer",
+                        stacklevel=3,
+                    )
             while self.steps < config.environment_steps:
                 self._switch.learning.fill_(self.steps >= config.warmup_steps)
                 executed = self._keep(next(rounds))
