@@ -44,7 +44,7 @@ class BudgetOptions(MeasuredOptions):
 @script("budget.py")
 def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and number of iterations."""
-    presets = {name: study(BudgetOptions, base, observations=1_000) for name, base in PRESETS.items()}
+    presets = {name: study(BudgetOptions, base, measured=1_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "budget", __doc__)
     from lab.demonstrations.tasks import title_of
     from lab.reporting.plots import plot_lines

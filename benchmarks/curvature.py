@@ -28,7 +28,7 @@ class CurvatureOptions(MeasuredOptions):
 @script("curvature.py")
 def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
-    presets = {name: study(CurvatureOptions, base, observations=2_000) for name, base in PRESETS.items()}
+    presets = {name: study(CurvatureOptions, base, measured=2_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "curvature", __doc__)
     import torch
 

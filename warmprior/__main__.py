@@ -314,7 +314,7 @@ class Evaluation:
     Attributes:
         nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
         held_out: number of last demonstrations to leave out for measuring the error of actions; by default
-            a tenth if no environment is known, else none
+            a tenth, or one of few, if no environment is known, else none
     """
 
     nfe: int | None = None
@@ -396,8 +396,10 @@ def train(
         except ImportError as missing:
             print(f"no episodes can be played here, so the policy is only trained: {missing}")
     count = whole.facts["demonstrations"]
-    tenth = count // 10 if whole.environment is None else 0
-    task, left_out = whole.split(tenth if evaluation.held_out is None else evaluation.held_out)
+    held_out = evaluation.held_out
+    if held_out is None:
+        held_out = min(count - 1, max(1, count // 10)) if whole.environment is None else 0
+    task, left_out = whole.split(held_out)
     print(task.recording.text("--{}"), flush=True)
     name = f"{task.name}-{task.style}-{','.join([prior.name, *options])}-seed{training.seed}"
     actor = train_policy(
@@ -422,6 +424,8 @@ def train(
         )
         for n, error in errors_of(actor, left_out, (*nfes, sampling.evaluations())).items():
             print(f"  NFE {n}: {error:.4f}")
+    elif whole.environment is None:
+        print("no demonstration is held out, so no error is measured")
     if playable:
         print(f"to play it: {command_of('evaluate', saved)} --nfe {' '.join(map(str, nfes[::-1]))}")
     else:

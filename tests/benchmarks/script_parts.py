@@ -50,6 +50,6 @@ def flow(run, validation, **more):
     """The report on the flows of a finished run."""
     import curvature
 
-    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6}
+    few = {"run": run, "validation": validation, "out": f"{run}-flow", "measured": 6}
     assert curvature.main(command_line(**few | more)) == 0
     return Path(f"{run}-flow", "report.md").read_text()

@@ -294,7 +294,7 @@ def test_the_study_of_sigma(monkeypatch):
 def test_the_curvature(monkeypatch):
     assert default(curvature, "n_steps") == default(flow_paths, "n_steps") == facts.CURVATURE_STEPS
     for preset in presets_of("curvature", monkeypatch).values():
-        assert preset.observations == facts.CURVATURE_OBSERVATIONS
+        assert preset.measured == facts.CURVATURE_OBSERVATIONS
 
 
 def test_the_study_without_chunks(monkeypatch):

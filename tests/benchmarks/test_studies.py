@@ -36,7 +36,7 @@ def finished(inline, short_episodes, dataset, tmp_path_factory):
 
 
 def measured(out, validation):
-    return {"out": out, "validation": validation, "observations": 20}
+    return {"out": out, "validation": validation, "measured": 20}
 
 
 def test_curvature_of_a_finished_run_trains_nothing(finished, dataset, validation, tmp_path, capsys):
@@ -145,14 +145,14 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
     path, lengths = tmp_path / "lift.hdf5", (30, 5, 40, 25)
     masks = {"train": [0, 1, 2], "valid": [3]}
     write_robomimic_file(path, lengths=lengths, task="lift", masks=masks)
-    few = {"observations": 10, "prior": ["gaussian", "past"], "nfe": 1}
+    few = {"measured": 10, "prior": ["gaussian", "past"], "nfe": 1}
     out = tmp_path / "runs" / "masked"
     assert curvature.main(options(path, out, mask="train", **few)) == 0
     assert described(out, "tasks")[0]["demonstrations"] == 3
     assert "10 observations of lift.hdf5 (mask valid)" in (out / "report.md").read_text()
     # So of the finished run, whose options are not typed again.
     again = tmp_path / "runs" / "again"
-    assert curvature.main(command_line(run=out, observations=10, out=again)) == 0
+    assert curvature.main(command_line(run=out, measured=10, out=again)) == 0
     assert stored(again, "curvature") == stored(out, "curvature")
 
 
@@ -163,7 +163,7 @@ def test_demonstrations_that_were_trained_on_are_not_held_out(tmp_path, given, c
     masks = {"train": [0, 1, 2], "valid": [2, 3]}
     write_robomimic_file(path, lengths=(30, 5, 40, 25), task="lift", masks=masks)
     shutil.copy(path, copy)
-    argv = options(path, tmp_path / "runs" / "out", mask="train", prior="past", observations=10)
+    argv = options(path, tmp_path / "runs" / "out", mask="train", prior="past", measured=10)
     argv += command_line(validation=copy) if given else []
     line = refused(curvature.main, argv, capsys)
     number = "3 of 4" if given else "1 of 2"
@@ -189,7 +189,7 @@ def test_what_cannot_be_recorded_again_is_measured_on_the_training_data(minari, 
         )
         more = {"task": f"{drift.__name__}:task"}
     out = tmp_path / "out"
-    argv = drift.arguments(out, **more, seeds=1, episodes=None, nfe=None, observations=20)
+    argv = drift.arguments(out, **more, seeds=1, episodes=None, nfe=None, measured=20)
     assert curvature.main(argv) == 0
     assert "observations of the TRAINING demonstrations (not held out)" in (out / "report.md").read_text()
 
@@ -201,7 +201,7 @@ def test_chosen_observations_are_read_from_held_out_demonstrations(tmp_path, mon
     monkeypatch.setattr(drift, "task", lambda: Task(open_demonstrations(path), observations=keys))
     data, run = DataOptions(task=(f"{drift.__name__}:task",)), Run(out=tmp_path)
     (policy,) = common.policies_of(Options(data, sources=Sources(prior=("past",)), run=run))
-    measured, words = held_out(MeasuredOptions(data, validation=other, observations=20, run=run), policy)
+    measured, words = held_out(MeasuredOptions(data, validation=other, measured=20, run=run), policy)
     seen = policy.task().normalizer.denormalize(measured.data)["observation"]
     torch.testing.assert_close(seen, RobomimicDemonstrations(other).steps(observations=keys)["observation"])
     assert words == "other.hdf5"

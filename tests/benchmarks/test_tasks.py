@@ -8,6 +8,8 @@ import pytest
 import robomimic
 import torch
 
+from lab.demonstrations.data_options import DataOptions
+from lab.demonstrations.tasks import load_task
 from lab.options.options import Options, with_parts
 from lab.options.stored_options import stored_options
 from lab.running.policies import policies_of
@@ -19,7 +21,7 @@ from warmprior import ImageEncoder
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
-from warmprior.envs.tasks import TaskSpec
+from warmprior.envs.tasks import TASKS, TaskSpec
 from warmprior.saving import load_policy
 from warmprior.saving.checkpoint import load_state
 
@@ -37,6 +39,14 @@ def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validatio
     assert [load_policy(path).network.action_dim for path in paths] == [10, 7]
     # What reads the run later knows it as well.
     assert "Lift-PH, absolute actions" in flow(tmp_path / "absolute", validation)
+
+
+def test_observations_of_a_file_are_chosen(dataset):
+    options = DataOptions(dataset=dataset, observations=("robot0_eef_pos", "object"))
+    task, usual = load_task(options, None), load_task(DataOptions(dataset=dataset), None)
+    assert task.data["observation"].shape[-1] == 3 + TASKS["lift"].object_dim
+    assert task.make_env().reset()["observation"].shape == task.data["observation"].shape[1:]
+    assert task.identity != usual.identity
 
 
 def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path, capfd):

@@ -56,6 +56,16 @@ def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, 
     assert not missing(said["data"], "arm.hdf5", "2 demonstrations", "27 steps")
 
 
+@pytest.mark.parametrize(
+    ("count", "line"), [("1", "no demonstration is held out"), ("2", "demonstrations (1)")]
+)
+def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
+    path = robot_file(tmp_path / "arm.hdf5")
+    words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --demonstrations {count}"
+    assert main(words.split()) == 0
+    assert line in capsys.readouterr().out
+
+
 def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
     task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
@@ -198,6 +208,7 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
     words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
     words += " --observations observation.state observation.effort --images observation.images.front"
+    words += " --held-out 0"
     assert main(words.split()) == 0
     folder = capsys.readouterr().out.splitlines()[-1]
     assert main(["info", folder]) == 0

@@ -84,6 +84,9 @@ class DataOptions(Resizing):
             numbers for ph and mh
         actions: actions of the policies: deltas as recorded, or the absolute poses that they target
         obs: observations of the policies: state of robot and objects, or state of the robot and images
+        observations: observations of the policies, in this order, of --dataset (default: the task's)
+        joints: observation of the joint positions that absolute actions of --dataset target; "" for none
+            (default: as python -m warmprior train recognises it)
         images: images, such as agentview_image (default: those of the task's two cameras, or four with two
             arms)
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster
@@ -105,6 +108,8 @@ class DataOptions(Resizing):
     demonstrations: tuple[int, ...] = ()
     actions: Actions = "delta"
     obs: Literal["state", "image"] = "state"
+    observations: tuple[str, ...] | None = None
+    joints: str | None = None
     images: tuple[str, ...] = ()
     fast_rendering: bool = False
 
@@ -132,6 +137,8 @@ class DataOptions(Resizing):
             raise ValueError("--force-download belongs to --download")
         if self.mask is not None and self.generated:
             raise ValueError("--mask is that of a file: add --download, or --dataset FILE")
+        if self.dataset is None and (self.observations is not None or self.joints is not None):
+            raise ValueError("--observations and --joints choose among those of --dataset: name one")
         if self.obs == "image":
             try:
                 require_rendering()

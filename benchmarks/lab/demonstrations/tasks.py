@@ -48,7 +48,14 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
             raise ValueError(f"{path} has no images, and its task is unknown: name --images")
         pictured = with_images(demonstrations, images, options.fast_rendering)
     play = Play(horizon=options.horizon, fast_rendering=bool(images) and options.fast_rendering)
-    task = Task(pictured, images=images, actions=options.actions, play=play)
+    task = Task(
+        pictured,
+        observations=options.observations,
+        images=images,
+        joints=options.joints,
+        actions=options.actions,
+        play=play,
+    )
     if task.environment is None:
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "

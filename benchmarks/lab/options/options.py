@@ -237,12 +237,12 @@ class MeasuredOptions(Options):
     """Options of a comparison with measures on held-out observations."""
 
     validation: Path | None = None  # demonstrations to measure on, as for --dataset (default: generated)
-    observations: int = 500  # number of observations to measure on; the paper's curvature has 2000
+    measured: int = 500  # number of observations to measure on; the paper's curvature has 2000
 
     def check(self) -> None:
         super().check()
         check_single(self, "task", "style", "chunk")
-        check_counts(self, "observations")
+        check_counts(self, "measured")
         if self.validation is not None:
             check_place(self.validation, "--validation")
 

@@ -92,7 +92,7 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
     """
     place: Path | str
     task, chunk_length = policy.task(), policy.method.chunk_length
-    facts, device, count = task.facts, options.run.device, options.observations
+    facts, device, count = task.facts, options.run.device, options.measured
     validation, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
     shape: dict[str, Any] = {"observation_steps": policy.network.observation_steps}
