@@ -249,7 +249,8 @@ def play(options: argparse.Namespace) -> None:
     """Train the policy, run the loop, and report the timing of its steps."""
     check_positive(**{"--rate": options.rate})
     check_not_negative(**{"--decision": options.decision})
-    policy = trained(options.camera, options.rate, options.iterations)  # yours: load_policy("policies/...")
+    # Yours: load_policy("policies/...") of warmprior.saving.
+    policy = trained(options.camera, options.rate, options.iterations)
     policy.register_forward_pre_hook(lambda module, inputs: time.sleep(options.decision))
     robot = SimulatedArm(options.camera, options.unplug)
     record = run(robot, policy, options.rate, options.seconds)

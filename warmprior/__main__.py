@@ -510,7 +510,7 @@ def observe(file: Path, out: Path, /, *, demonstrations: int | None = None) -> N
     print(observe_recordings(file, out, demos=demonstrations))
 
 
-COMMANDS = (info, push, evaluate, train, improve, export, convert, observe)
+COMMANDS = (train, evaluate, info, improve, export, push, convert, observe)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -110,7 +110,7 @@ def sentences() -> dict[str, list[str]]:
             f"{span(short)} points less at one evaluation",
             f"{long_rates[0]}% and {long_rates[1]}% at nine, three and one "
             f"({', '.join(c.chance for c in long)})",
-            f"each at its better length of training, {better_rates[0]} and {better_rates[1]}",
+            f"each source at its own better length, {better_rates[0]}% and {better_rates[1]}%",
             f"source, the decoder of a CVAE, solves {rates[CVAE, 9]}% ({learned[9].chance})",
             f"the regression MIP {rates['mip', 2]}% in two evaluations ({mip.chance})",
             f"source with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% ({absolute.chance})",
@@ -122,8 +122,8 @@ def sentences() -> dict[str, list[str]]:
             f"chance (WP-Past with 25: {past_once.chance})",
             f"solve {fifty[0]} and {fifty[1]}%, and the Gaussian source {fifty[2]}",
             f"WP-Past and WP-Preview succeed {span(short)} points less often at one step",
-            f"the Gaussian source then solves {transport[2]}% at one step in place of {transport[0]}, "
-            f"and WP-Past {transport[3]} in place of {transport[1]}",
+            f"the Gaussian source then solves {transport[2]}% at one step (up from {transport[0]}), "
+            f"and WP-Past {transport[3]}% (up from {transport[1]})",
             f"at one step sources solve {span(fewer)}% fewer episodes than at nine, on average "
             f"(leaderboard); with an L1 loss {span(fewer_l1)}%",
         ],
