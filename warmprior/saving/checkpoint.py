@@ -109,7 +109,7 @@ def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None
                 saved, value = ({key: each.get(key) for key in keys} for each in (saved, value))
             raise ValueError(
                 f"{path} belongs to another {part}: it has {saved}, this run has {value}. Use the same "
-                "options, or another output folder (--out)."
+                "options, or another output folder."
             )
 
 
