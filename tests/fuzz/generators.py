@@ -479,7 +479,7 @@ def _odd_text(path: Path, rng: np.random.Generator) -> str:
 
 
 def _minari_says_so(folder: Path, data: TensorDictBase, environment: dict[str, Any]) -> bool:
-    """Whether Minari alone reads the same."""
+    """Return True if Minari alone reads the same."""
     os.environ["MINARI_DATASETS_PATH"] = str(folder)
     dataset = minari.load_dataset(MINARI)
     episodes = list(dataset.iterate_episodes())

@@ -1,1 +1,1 @@
-"""What a user chooses: dataclasses of options, which need no PyTorch to be read, shown and checked."""
+"""Dataclasses of what a user chooses, which are read, shown and checked without PyTorch."""

@@ -92,7 +92,7 @@ def check_statistics(config: Any, meta: Any) -> None:
 
 
 UNBUILT = (ValueError, TypeError, AttributeError, ArithmeticError, LookupError, AssertionError)
-"""What options raise that no policy can be built of."""
+"""Options that no policy can be built of raise these errors."""
 
 
 class WholePolicy(nn.Module):
