@@ -348,7 +348,8 @@ def train(
     """Train a policy on demonstrations, without playing episodes.
 
     Args:
-        place: a robomimic HDF5 file, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
+        place: a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a
+            LeRobotDataset, or minari:NAME
         data: options of the demonstrations
         source: options of the source
         training: options of the recipe

@@ -57,6 +57,11 @@ class Demonstrations:
     normalised: ClassVar[bool] = False
     """True if the numbers are in normalised units."""
 
+    @classmethod
+    def reads(cls, place: str) -> bool:
+        """Return whether a place is in this format."""
+        return place.startswith(cls.prefix)
+
     def __init__(
         self,
         place: str | Path,
@@ -81,7 +86,7 @@ class Demonstrations:
     @property
     def name(self) -> str:
         """The name of the place in results, such as ``"square.hdf5"``."""
-        name = f"{self.prefix}{self.title}" if self.prefix else Path(self.place).name
+        name = f"{self.prefix}{self.title}" if self.prefix else Path(self.place).absolute().name
         return name if self.mask is None else f"{name} (mask {self.mask})"
 
     @property

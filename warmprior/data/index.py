@@ -65,6 +65,7 @@ class DatasetIndex:
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
         whole: False if only some of the demonstrations were asked for.
         rate: control steps per second, if they are known.
+        rewards: False if none are recorded.
         joints: the observation whose numbers the actions may set, by their names; ``""`` if there is none.
     """
 
@@ -85,6 +86,7 @@ class DatasetIndex:
     task: TaskSpec | None = None
     whole: bool = True
     rate: float | None = None
+    rewards: bool = True
     joints: str = ""
 
     def __post_init__(self) -> None:

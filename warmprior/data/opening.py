@@ -10,15 +10,17 @@ from typing import Any
 from warmprior.checks import check_choice
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.hdf5_folder import RobomimicFolder
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.data.formats.minari import MinariDemonstrations
 
 FORMATS: tuple[type[Demonstrations], ...] = (
     LeRobotDemonstrations,
     MinariDemonstrations,
+    RobomimicFolder,
     RobomimicDemonstrations,
 )
-"""The formats; the first whose prefix a place has reads it."""
+"""The formats; the first that says so reads a place."""
 
 
 def open_demonstrations(
@@ -33,8 +35,8 @@ def open_demonstrations(
     """Return the demonstrations at a place, raw as recorded; values are only read by their ``steps``.
 
     Args:
-        place: a robomimic or MimicGen HDF5 file; ``lerobot:`` and the folder or repository of a
-            LeRobotDataset v3; or ``minari:`` and the name of a Minari dataset.
+        place: a robomimic or MimicGen HDF5 file, or a folder of them; ``lerobot:`` and the folder or
+            repository of a LeRobotDataset v3; or ``minari:`` and the name of a Minari dataset.
 
     Keyword Args:
         demos: number of demonstrations to take, from the first on; all by default.
@@ -58,7 +60,7 @@ def open_demonstrations(
             ...
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
-    kind = next(kind for kind in FORMATS if str(place).startswith(kind.prefix))
+    kind = next(kind for kind in FORMATS if kind.reads(str(place)))
     known = [name for base in kind.__mro__[:-1] for name in signature(base).parameters]
     for name in options:
         check_choice(f"an option of {place}", name, sorted({*known} - {"place", "options"}))

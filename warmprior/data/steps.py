@@ -66,12 +66,13 @@ LOOKED_AT = 20  # number of demos that decide if actions are poses
 POSES = 0.25  # between 0.01, for poses a control step ahead of the hand, and 1, for unrelated numbers
 
 
-def _are_poses(index: DatasetIndex, reader: DemonstrationReader, declared: tuple[str, str] | None) -> bool:
+def are_poses(index: DatasetIndex, reader: DemonstrationReader) -> bool:
     """Return True if actions are world poses that ``env_args`` declare as deltas (``low_dim_abs.hdf5``).
 
     The positions decide: poses are near the hand, and deltas are not, whatever their length. Raises
     DatasetError if ``env_args`` are wrong in another way.
     """
+    declared = declared_poses(index.path, index.env_args) if index.env_args else None
     arms, rest = divmod(index.action_dim, 7)
     hands = [f"robot{arm}_eef_pos" for arm in range(arms)]
     if declared is None or rest or not set(hands) <= set(index.available_keys):
@@ -224,10 +225,7 @@ def _actions(
     actions: StoredActions,
 ) -> Callable[[str, np.ndarray], None]:
     """Return the function that reads the actions of a demo."""
-    declared = (
-        None if actions == "stored" or not index.env_args else declared_poses(index.path, index.env_args)
-    )
-    if _are_poses(index, reader, declared):
+    if actions != "stored" and are_poses(index, reader):
         if conventions is None:
             raise DatasetError(
                 f"{index.path}: actions are absolute poses, but env_args declare deltas: use "

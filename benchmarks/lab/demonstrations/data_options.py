@@ -74,8 +74,8 @@ class DataOptions(Resizing):
             package.module:function of your own, which takes these options and returns a Task
         style: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
             source (human) or core (generated from source)
-        dataset: demonstrations in place of generated ones: a robomimic HDF5 file, lerobot:FOLDER or
-            lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
+        dataset: demonstrations in place of generated ones: a robomimic HDF5 file or a folder of them,
+            lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
         download: download the official demonstrations, in place of generated ones
         force_download: download the official demonstrations again, in place of a broken local copy
         mask: mask of the file, such as train, whose demonstrations to use (default: all)

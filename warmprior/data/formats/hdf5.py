@@ -160,7 +160,7 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     h5py = require("h5py", "sim")
     path = Path(path)
     if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name a file, or a LeRobotDataset as lerobot:{path}")
+        raise IsADirectoryError(f"{path} is a folder: name a file of it")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; check the path")
     try:
@@ -364,9 +364,7 @@ class RobomimicDemonstrations(Demonstrations):
     @override
     def check(self) -> None:
         if not self.path.is_file():
-            folder = (self.path / "meta" / "info.json").is_file()
-            hint = f"; for a LeRobotDataset write lerobot:{self.place}" if folder else ""
-            raise FileNotFoundError(f"{self.place}: no such file{hint}")
+            raise FileNotFoundError(f"{self.place}: no such file")
 
     @override
     def resolved(self) -> str:
@@ -458,6 +456,7 @@ class RobomimicDemonstrations(Demonstrations):
             available_keys=available,
             taken_by=taken_by,
             action_dim=widths["actions"],
+            rewards="rewards" in widths,
             env_args=env_args,
             task=task,
             whole=len(selected) == count,
