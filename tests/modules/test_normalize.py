@@ -3,7 +3,7 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded
+from torchrl.data import Bounded, MultiOneHot
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -91,11 +91,18 @@ def test_an_environment_follows_statistics_that_are_loaded_later():
         assert torch.equal(env.rollout(3)["observation"][:, 2:], expected[:, 2:])  # the others count
 
 
-def test_whole_numbers_are_no_actions_of_a_policy():
+@pytest.mark.parametrize(
+    ("spec", "kind"),
+    [
+        (Bounded(0, 9, (2,), dtype=torch.int64), "[2] of torch.int64"),
+        (MultiOneHot([3, 4]), "MultiOneHot [7]"),
+    ],
+)
+def test_whole_numbers_are_no_actions_of_a_policy(spec, kind):
     env = CountingEnv(5)
-    env.action_spec = Bounded(0, 9, (2,), dtype=torch.int64)
+    env.action_spec = spec
     normalizer = Normalizer({"action": torch.zeros(2)}, {"action": torch.full((2,), 9.0)})
-    with raises(TypeError, "int64", "action", "rounds"):
+    with raises(TypeError, kind, "action", "rounds"):
         TransformedEnv(env, *normalizing_transforms(normalizer)).action_spec  # noqa: B018
 
 

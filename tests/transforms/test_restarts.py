@@ -166,9 +166,14 @@ def test_autoresets_of_torchrl_take_single_steps(append):
     check_equal(played(env(3, (6,))), reference((6,), 3))  # one row alone stops at its end
 
 
-def test_workers_may_restart_by_themselves():
-    make = [lambda n=n: AutoResetEnv(Auto((n,), restarts=True), AutoResetTransform()) for n in LENGTHS]
-    env = TransformedEnv(SerialEnv(3, make), policy_transforms(PRIOR, execute=3))
+@pytest.mark.parametrize("inside", [False, True])
+def test_workers_may_restart_by_themselves(inside):
+    def around(env):
+        return TransformedEnv(env, policy_transforms(PRIOR, execute=3))
+
+    first, last = (around, lambda env: env) if inside else (lambda env: env, around)
+    make = [lambda n=n: first(AutoResetEnv(Auto((n,), restarts=True), AutoResetTransform())) for n in LENGTHS]
+    env = last(SerialEnv(3, make))
     found, expected = env.rollout(7, env.rand_action, break_when_any_done=False), reference(LENGTHS, 3)
     for key in (keys.EXECUTED, "reward", "done"):
         torch.testing.assert_close(found["next", key].squeeze(1), expected["next", key])

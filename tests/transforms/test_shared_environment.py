@@ -3,7 +3,15 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, RenameTransform, SerialEnv, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    FlattenAction,
+    FlattenObservation,
+    RenameTransform,
+    SerialEnv,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from tests.errors import raises
@@ -139,10 +147,42 @@ def test_a_group_of_agents_is_refused(n, around):
         lambda: ChunkStep(H, action_keys=[key]),
         lambda: ObservationStack(1, observation_key=("agents", "observation")),
     ):
-        with raises(ValueError, "groups of agents"):
+        with raises(ValueError, "groups of agents", "FlattenObservation", "FlattenAction"):
             _ = TransformedEnv(around(make_env()), transforms()).specs
-        with raises(ValueError, "groups of agents"):
+        with raises(ValueError, "groups of agents", "FlattenObservation", "FlattenAction"):
             _ = around(TransformedEnv(make_env(), transforms())).specs
+
+
+class Agents(CountingEnv):
+    """Three agents that see their own number, and the actions that they were given."""
+
+    def __init__(self):
+        super().__init__(LENGTH)
+        self.observation_spec = Composite(agents=Composite(observation=Unbounded((3, 4)), shape=(3,)))
+        self.action_spec = Composite(agents=Composite(action=Unbounded((3, 2)), shape=(3,)))
+        self.given = []
+
+    def _seen(self, out):
+        seen = torch.arange(3.0)[:, None].expand(3, 4).clone()
+        return out.exclude("observation").set("agents", TensorDict({"observation": seen}, [3]))
+
+    def _step(self, tensordict):
+        self.given.append(tensordict["agents", "action"])
+        return super()._step(tensordict.set("action", self.given[-1][0]))
+
+
+def test_a_centralised_policy_moves_a_group_as_one_vector():
+    policy, base = mlp_actor(PastPrior(H), action_dim=6, observation_dim=12, steps=1), Agents()
+    seen = FlattenObservation(-2, -1, [("agents", "observation")], ["observation"])
+    moved = FlattenAction(in_keys_inv=[("agents", "action")], out_keys_inv=["action"])
+    decisions = TransformedEnv(base, Compose(seen, moved, *policy_transforms(policy))).rollout(2, policy)
+    assert decisions["observation"][0].tolist() == [[0.0] * 4 + [1.0] * 4 + [2.0] * 4]
+    chunks = decisions["vla_action", "chunk"].flatten(0, 1)
+    assert torch.equal(torch.stack(base.given), chunks.unflatten(-1, (3, 2)))
+    renamed = RenameTransform([("agents", "observation")], ["observation"])
+    env = TransformedEnv(Agents(), Compose(renamed, moved.clone(), *policy_transforms(policy)))
+    with raises(ValueError, "12", "3, 4", "FlattenObservation"):
+        env.rollout(1, policy)
 
 
 @pytest.mark.parametrize("inside", [False, True])

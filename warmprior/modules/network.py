@@ -81,7 +81,8 @@ class VelocityNetwork(nn.Module, Registered):
         if isinstance(observation, TensorDictBase):
             entries = sorted(map(str, observation.keys(True, True)))
             raise ValueError(f"{built}, got the entries {entries}: write a network that encodes them")
-        raise ValueError(f"{built}, got {tuple(observation.shape)}")
+        hint = ": FlattenObservation makes them vectors" if observation.ndim > 3 else ""
+        raise ValueError(f"{built}, got {tuple(observation.shape)}{hint}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """Encode an observation once, before the field is evaluated many times; by default return it.

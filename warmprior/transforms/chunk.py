@@ -26,7 +26,7 @@ from warmprior import keys
 from warmprior.checks import check_between, check_choice, check_whole_numbers
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
-from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
+from warmprior.transforms.inner_step import GROUP, EnvTransform, InnerStep, rows_where, set_aside
 from warmprior.transforms.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.restarts import flat
 from warmprior.transforms.stack import ObservationStack
@@ -437,7 +437,7 @@ class ChunkStep(EnvTransform):
                 raise ValueError(
                     f"ChunkStep takes actions that are vectors [*B, d_a], but {action_key!r} has shape "
                     f"{tuple(leaf.shape)} for the batch size {tuple(input_spec.shape)}: make a number a "
-                    "vector with UnsqueezeTransform; groups of agents [*B, n, d_a] are not supported"
+                    f"vector with UnsqueezeTransform; {GROUP}"
                 )
             *batch, width = leaf.shape
             actions[chunk_key] = leaf.unsqueeze(-2).expand(*batch, self.prediction_length, width).clone()

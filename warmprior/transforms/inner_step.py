@@ -19,6 +19,11 @@ from warmprior.transforms.restarts import NATIVE, Restarts
 KEPT = "_kept"
 """The key of observations that :func:`set_aside` keeps, at the root of a step's input."""
 
+GROUP = (
+    "groups of agents are not supported: a centralised policy sees and moves all of them as one vector, "
+    "after FlattenObservation(-2, -1, [observation], [new key]) and FlattenAction"
+)
+
 
 def check_unwritten(observation_spec: Any, names: Iterable[NestedKey], whose: str) -> None:
     """Raise ValueError if the environment already writes a key that a transform would write."""

@@ -44,12 +44,13 @@ class FloatScaling(ActionScaling):
         for key in self.in_keys_inv:
             if key in action_spec.keys(True, True):
                 leaf = action_spec[key]
-                check_width(key, leaf.shape, self.loc)  # one number would fit any width
-                if not leaf.dtype.is_floating_point:
+                if not leaf.dtype.is_floating_point:  # of MultiDiscrete the width may differ as well
+                    kind = f"{type(leaf).__name__} {list(leaf.shape)} of {leaf.dtype}"
                     raise TypeError(
-                        f"the environment takes {leaf.dtype} for {key}, and a policy writes real numbers: "
-                        "append a transform before the normaliser that rounds them"
+                        f"the environment takes {kind} for {key}, and a policy writes real numbers: append a "
+                        "transform before the normaliser that rounds or encodes them"
                     )
+                check_width(key, leaf.shape, self.loc)  # one number would fit any width
         return super().transform_action_spec(action_spec)
 
 

@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from warmprior import keys
 from warmprior.checks import check_keys, check_whole_numbers
-from warmprior.transforms.inner_step import EnvTransform, observed, set_aside
+from warmprior.transforms.inner_step import GROUP, EnvTransform, observed, set_aside
 
 
 class ObservationStack(EnvTransform):
@@ -93,7 +93,7 @@ class ObservationStack(EnvTransform):
         if shape != observations.shape:
             raise ValueError(
                 f"ObservationStack found {key!r} in a branch of shape {list(shape)}, in an environment of "
-                f"batch size {list(observations.shape)}: groups of agents are not supported"
+                f"batch size {list(observations.shape)}: {GROUP}"
             )
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
