@@ -17,6 +17,7 @@ import tyro
 from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
+from warmprior.options.agent import Algorithm
 from warmprior.options.data import Actions, Resizing
 from warmprior.options.evaluation import EVALUATION_SEED
 from warmprior.options.training import NetworkOptions, TrainingConfig
@@ -200,7 +201,7 @@ def improve(
     /,
     *,
     steps: int = 100_000,
-    algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na",
+    algorithm: Algorithm = "dsrl-na",
     delta: float | None = None,
     nfe: int | None = None,
     num_envs: int = 4,

@@ -20,7 +20,7 @@ FORMATS: tuple[type[Demonstrations], ...] = (
     RobomimicFolder,
     RobomimicDemonstrations,
 )
-"""The formats; the first that says so reads a place."""
+"""The formats; the first whose ``reads`` accepts a place opens it."""
 
 
 def open_demonstrations(
@@ -61,6 +61,7 @@ def open_demonstrations(
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     kind = next(kind for kind in FORMATS if kind.reads(str(place)))
+    # A format passes what it does not know on to its base class.
     known = [name for base in kind.__mro__[:-1] for name in signature(base).parameters]
     for name in options:
         check_choice(f"an option of {place}", name, sorted({*known} - {"place", "options"}))

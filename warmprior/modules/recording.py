@@ -66,10 +66,12 @@ class Recording:
             f"{', '.join(names)} ({option.format(taken_by) if taken_by else 'no option takes it'})"
             for taken_by, names in self.left_out.items()
         ]
-        s = "" if self.demonstrations == 1 else "s"
+        demonstrations = (
+            "1 demonstration" if self.demonstrations == 1 else f"{self.demonstrations} demonstrations"
+        )
         hint = f" ({option.format('joints')} names what absolute joint targets set)"
         return {
-            "data": f"{self.name}: {self.demonstrations} demonstration{s}, {self.steps:,} steps",
+            "data": f"{self.name}: {demonstrations}, {self.steps:,} steps",
             "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
             "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
             "left out": "; ".join(left_out) or "nothing",

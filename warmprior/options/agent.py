@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from warmprior.checks import (
     check_between,
@@ -13,6 +13,8 @@ from warmprior.checks import (
     check_whole_numbers,
     given,
 )
+
+Algorithm = Literal["dsrl-na", "dsrl-sac"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class PriorSpaceConfig:
         (1000000, 0.99)
     """
 
-    algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"
+    algorithm: Algorithm = "dsrl-na"
     environment_steps: int = 1_000_000
     warmup_steps: int = 24_000
     delta: float | None = None
@@ -78,7 +80,7 @@ class PriorSpaceConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_choice("algorithm", self.algorithm, ("dsrl-na", "dsrl-sac"))
+        check_choice("algorithm", self.algorithm, get_args(Algorithm))
         if self.algorithm == "dsrl-sac" and not self.backup_entropy:
             raise ValueError("dsrl-sac has backup_entropy=True; leave it out")
         check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)

@@ -111,8 +111,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 class TrainingConfig:
     """A training recipe; by default that of most result tables, for a small network on a CPU.
 
-    The defaults were chosen by success rate at several iteration counts. PAPER is the paper's recipe.
-    Raises ValueError if a number is out of range.
+    The defaults were chosen by success rate at several iteration counts.
 
     Attributes:
         iterations: gradient steps.
@@ -135,6 +134,9 @@ class TrainingConfig:
         precision: precision of the network's matrix products in training; weights, averages and optimiser are
             float32.
         cold_probability: share of the windows whose history is withheld; Algorithm 1 withholds none.
+
+    Raises:
+        ValueError: if a number is out of range, or a choice is unknown.
 
     Examples:
         >>> from warmprior.training import TrainingConfig

@@ -11,7 +11,7 @@ import tyro
 
 from lab.demonstrations.data_options import check_counts
 from lab.options.options import FinishedRun, Options, check_given, check_single
-from warmprior.options.agent import PriorSpaceConfig
+from warmprior.options.agent import Algorithm, PriorSpaceConfig
 
 if TYPE_CHECKING:
     from lab.methods.methods import Method
@@ -33,9 +33,6 @@ AgentOptions: Any = make_dataclass(
     frozen=True,
     namespace={"__doc__": str(PriorSpaceConfig.__doc__).replace("``", "")},
 )
-
-
-Algorithm = Literal["dsrl-na", "dsrl-sac"]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from warmprior.data.steps import StoredActions, are_poses
 from warmprior.io.files import digest_of, file_digest
 
 EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards")
-"""What all files of a folder have in common."""
+"""All files of a folder agree in these entries of their indices."""
 
 
 class RobomimicFolder(Demonstrations):
