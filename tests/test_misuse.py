@@ -1,6 +1,7 @@
 """What is easily done wrong with the library's parts, and what the error says."""
 
 import pickle
+from copy import deepcopy
 from functools import partial
 from multiprocessing.context import set_spawning_popen
 from multiprocessing.popen_spawn_posix import _DupFd
@@ -13,6 +14,7 @@ from torchrl.envs import GymEnv, RenameTransform, TransformedEnv
 from torchrl.record.loggers.csv import CSVLogger
 
 from tests.errors import raises
+from tests.processes import apart
 from tests.toy_env import demonstrations, mlp_actor
 from warmprior import (
     PastPrior,
@@ -25,6 +27,7 @@ from warmprior import (
 )
 from warmprior.envs import environment_of
 from warmprior.envs.description import registered_description
+from warmprior.keys import CHUNK
 from warmprior.training import BehaviourCloning, NetworkOptions, TrainingConfig, ema_of, train_policy
 
 PRIOR = PastPrior(4)
@@ -64,6 +67,21 @@ def test_a_generator_stays_in_its_process(monkeypatch):
         assert module(batch.copy()) is not None
     assert sent(policy, monkeypatch)(batch.copy(), generator=torch.Generator()) is not None
     assert sent(actor(), monkeypatch)(batch.copy()) is not None
+
+
+def test_a_generator_does_not_draw_in_forked_workers():
+    windows = window_transforms(steps(), PRIOR, observation_steps=1)
+    data, policy = windows(TensorDict({"frame": torch.tensor([3])}, [1])), actor(generator=torch.Generator())
+
+    @apart
+    def drawn():
+        for same in (policy, deepcopy(policy), policy.replace(nfe=1)):
+            with raises(RuntimeError, "same noise", "set_seed"):
+                same(data.copy())
+        others = [policy.replace(generator=own) for own in (None, torch.Generator())]
+        return [other(data.copy())[CHUNK].shape for other in others]
+
+    assert drawn() == 2 * [policy(data.copy())[CHUNK].shape]
 
 
 def test_a_policy_with_a_generator_can_be_sent():

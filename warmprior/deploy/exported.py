@@ -248,7 +248,6 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
         self.prior = from_config(Prior, description["prior"])
         self.shapes = {name: tuple(shape) for name, shape in description["shapes"].items()}
         self.action_dim, self.observation_steps = description["action_dim"], description["observation_steps"]
-        self.generator: torch.Generator | None = None
         self.device = torch.device("cpu")
         key = description["observation_key"]
         self.observation_key = tuple(key) if isinstance(key, list) else key

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import torch
+
+_forks = 0  # between the first process and this one
+
+
+def _count_fork() -> None:
+    global _forks
+    _forks += 1
+
+
+os.register_at_fork(after_in_child=_count_fork)
 
 
 class LeftBehind:
@@ -19,12 +30,23 @@ class Drawing:
     TorchRL's collectors have moved the weights away, and they would be lost.
     """
 
-    generator: Any = None
+    _generator: Any = None
+    _set_after = 0  # forks
+
+    @property
+    def generator(self) -> Any:
+        """The module's own generator, or what stands for it in a process that was forked since."""
+        left = self._generator is not None and self._set_after != _forks
+        return LeftBehind() if left else self._generator
+
+    @generator.setter
+    def generator(self, generator: torch.Generator | LeftBehind | None) -> None:
+        self._generator, self._set_after = generator, _forks
 
     def __getstate__(self) -> Any:
         state: Any = super().__getstate__()
         if self.generator is not None and get_spawning_popen() is not None:
-            state = {**state, "generator": LeftBehind()}
+            state = {**state, "_generator": LeftBehind()}
         return state
 
     def chosen_generator(self, generator: torch.Generator | None = None) -> torch.Generator | None:
