@@ -12,11 +12,13 @@ from tests.errors import raises
 from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
+from warmprior.data import demonstrations_of
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.deploy import AsyncExecutor
 from warmprior.evaluation import evaluate
 from warmprior.modules import PreconditionedNetwork
 from warmprior.saving import load_policy
+from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, make_network, train_policy
 from warmprior.training.train import new_policy
 
@@ -165,6 +167,17 @@ def test_a_fresh_policy_has_the_parts_that_were_asked_for():
     assert isinstance(made.network, PreconditionedNetwork) and made.sampling.max_nfe == 1
     width = task.vector.shape[-1]
     assert made.network.observation_dim > first.network.observation_dim == width
+
+
+def test_joint_targets_need_preconditioning():
+    plain = NetworkOptions(hidden_dim=8, observation_steps=1, precondition=False)
+    data = demonstrations()
+    data["action"] = data["observation"][:, :2] + 0.01
+    joints, none = (Task(demonstrations_of(data), joints=joints) for joints in ([0, 1], ""))
+    with raises(ValueError, "joints=''", "precondition=False"):
+        train_policy(joints, PastPrior(4), network=plain, training=CONFIG, description=None)
+    trained = train_policy(none, PastPrior(4), network=plain, training=CONFIG, description=None)
+    assert not isinstance(trained.network, PreconditionedNetwork)
 
 
 class Long(PastPrior):

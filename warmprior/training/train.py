@@ -24,7 +24,7 @@ from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import RestingAction, RestingTrend
+from warmprior.modules.trend import RestingAction, RestingJoints, RestingTrend
 from warmprior.objectives.flow_matching import Coupling
 from warmprior.options.training import NetworkOptions, Slope, TrainingConfig
 from warmprior.saving.policies import load_policy
@@ -169,6 +169,11 @@ def train_policy(
         raise ValueError("a source or start point that learns before the flow needs see_history=False")
     check_device(device)  # before the demonstrations are read
     task = _task_of(demonstrations, {"observations": observations, "images": images})
+    if isinstance(task.rest, RestingJoints) and not network.precondition:
+        raise ValueError(
+            "joint targets are learnt from the present joints by preconditioning: leave precondition=False "
+            "out, or turn the joints off (joints='')"
+        )
     if description is not None and isinstance(demonstrations, str | Path) and not rank():
         tqdm.write(task.recording.text(), file=sys.stderr)
     home = torch.device(device)
