@@ -1,3 +1,4 @@
+import re
 import shlex
 import shutil
 import sys
@@ -168,6 +169,19 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     written = {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")}
     assert main(small) == 0  # there is nothing to do
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
+    for words, facts in (
+        ("--iterations 4 --hidden-dim 9", ("iterations was 2 and is 4", "hidden_dim was 8 and is 9")),
+        ("--network plain_mlp --no-precondition", ("network was PreconditionedNetwork and is",)),
+        ("--demonstrations 1", ("demonstrations",)),
+    ):
+        assert main([*small, *words.split()]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert not missing(said, *facts, "--out") and "buffers" not in said
+        assert not re.search(r"\b[0-9a-f]{16}\b", said)  # no digest
+    assert load_policy(folder).sampling.nfe == 3
+    assert main([*small, "--nfe", "1"]) == 0
+    assert load_policy(folder).sampling.nfe == 1
+    assert not missing(capsys.readouterr().err, folder, "nfe was 3 and is 1")
 
 
 def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):

@@ -534,7 +534,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 config=(tyro.conf.OmitArgPrefixes,),  # --iterations, not --training.iterations
             )
         )
-        parsed()
+        from warmprior.saving.checkpoint import AnotherRunError
+
+        try:
+            parsed()
+        except AnotherRunError as error:
+            raise ValueError(f"{error} (--out)") from error
 
     return run_script(run, "warmprior")
 
