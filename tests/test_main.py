@@ -20,6 +20,7 @@ from warmprior.evaluation import play_episode
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
+from warmprior.training.gradient_step import GradientStep
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
@@ -154,7 +155,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         assert not missing(refused(argv, capsys), fact)
 
 
-def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
+def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys, monkeypatch):
     path, out = tmp_path / "lift.hdf5", tmp_path / "my runs"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     argv = ["train", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
@@ -167,7 +168,9 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     assert main(["info", folder]) == 0
     assert "PastPrior(chunk_length=8, sigma=0.3, correlation=0.5)" in capsys.readouterr().out
     written = {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")}
-    assert main(small) == 0  # there is nothing to do
+    compiled = []
+    monkeypatch.setattr(GradientStep, "compile", lambda update: compiled.append(update))
+    assert main([*small, "--compile"]) == 0 and compiled  # there is nothing to do
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
     for words, facts in (
         ("--iterations 4 --hidden-dim 9", ("iterations was 2 and is 4", "hidden_dim was 8 and is 9")),

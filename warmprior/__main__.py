@@ -43,6 +43,13 @@ def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPr
     return load_policy(folder, revision=revision)
 
 
+def _wanted(name: str, shape: Sequence[int]) -> str:
+    """Return in words what a robot has to give a policy under a name."""
+    if len(shape) == 3:
+        return f"{name} (any size, resized to {shape[1]} x {shape[2]})"
+    return f"{name} {tuple(shape)}"
+
+
 def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = ()) -> None:
     """Print what a saved policy needs, does and was trained on.
 
@@ -63,7 +70,7 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
     file = policy_file(folder, revision=revision)
     for name, value in {
-        "takes": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
+        "takes": "unknown" if shapes is None else ", ".join(map(_wanted, shapes, shapes.values())),
         **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
         "source": actor.prior,
         "start": actor.start or "the source",
@@ -300,11 +307,11 @@ class Source:
 
     Attributes:
         prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
-            in past,sigma=0.3
+            in past,sigma=0.3; by default past,correlation=0.5, or gaussian if actions are absolute targets
         chunk: chunk length H
     """
 
-    prior: str = "past,correlation=0.5"
+    prior: str | None = None
     chunk: int = 8
 
 
@@ -329,10 +336,12 @@ class Run:
     Attributes:
         out: folder of training runs, in which an interrupted one continues
         device: device of the network, such as cuda
+        compile: train with torch.compile, which needs a C++ compiler
     """
 
     out: Path = Path("policies")
     device: str = "cpu"
+    compile: bool = False
 
 
 def train(
@@ -368,7 +377,7 @@ def train(
     from warmprior.training.option_text import make
 
     check_device(run.device)  # before the demonstrations are read
-    prior, options = make(Prior, source.prior, source.chunk), source.prior.split(",")[1:]
+    make(Prior, source.prior or "gaussian", source.chunk)  # an error is better raised here
     sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
         place,
@@ -402,7 +411,9 @@ def train(
     if held_out is None:
         held_out = min(count - 1, max(1, count // 10)) if whole.environment is None else 0
     task, left_out = whole.split(held_out)
-    print(task.recording.text("--{}"), flush=True)
+    text = source.prior or ("past,correlation=0.5" if task.rest is None else "gaussian")
+    prior, options = make(Prior, text, source.chunk), text.split(",")[1:]
+    print(f"{task.recording.text('--{}')}\n{'source':13} {text} (--prior)", flush=True)
     name = f"{task.name}-{task.style}-{','.join([prior.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,
@@ -413,6 +424,7 @@ def train(
         network=network,
         training=training,
         device=run.device,
+        compile=run.compile,
         description=name,
     )
     saved = policy_path(run.out / name, training.iterations)
