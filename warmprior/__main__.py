@@ -276,29 +276,29 @@ class Data(Resizing):
 
     Attributes:
         observations: observations of the policy, in this order; by default the task's
+        images: images of the policy, in addition to the robot's state, such as agentview_image
+        demonstrations: number of demonstrations, from the first on; by default all
+        mask: mask of the file, such as train, whose demonstrations to use; by default all
         joints: observation of the joint positions that absolute actions target; by default observation.state
             of a LeRobotDataset with the names of the actions, if the numbers are near; "" for none
-        images: images of the policy, in addition to the robot's state, such as agentview_image
-        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
-        mask: mask of the file, such as train, whose demonstrations to use; by default all
-        demonstrations: number of demonstrations, from the first on; by default all
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit; by default ph, and human
             outside robosuite
         horizon: control steps per episode; by default the environment's own, or robosuite's for the style
+        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
     """
 
     observations: tuple[str, ...] | None = None
-    joints: str | None = None
     images: tuple[str, ...] = ()
-    fast_rendering: bool = False
-    actions: Actions = "delta"
-    mask: str | None = None
     demonstrations: int | None = None
+    mask: str | None = None
+    joints: str | None = None
+    actions: Actions = "delta"
     task: str | None = None
     style: str | None = None
     horizon: int | None = None
+    fast_rendering: bool = False
 
 
 @dataclass(frozen=True)
@@ -356,6 +356,9 @@ def train(
     network: NetworkOptions,
 ) -> None:
     """Train a policy on demonstrations, without playing episodes.
+
+    $ python -m warmprior train square.hdf5 --iterations 20000
+    $ python -m warmprior train lerobot:USER/NAME --images observation.images.front
 
     Args:
         place: a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a
@@ -529,8 +532,8 @@ COMMANDS = (train, evaluate, info, improve, export, push, convert, observe)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run command-line arguments, and return the exit code. User errors are reported in one line."""
-    argv = sys.argv[1:] if argv is None else argv
-    if list(argv[:1]) == ["--version"]:
+    argv = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    if argv[0] == "--version":
         print(f"warmprior {version('warmprior')}")
         return 0
 

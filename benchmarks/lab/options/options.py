@@ -118,7 +118,9 @@ class Run:
     # unit and paper
     preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered folder under runs/)
-    resume: bool = False  # continue the run in --out, with its options (default: the latest default folder)
+    resume: bool = (
+        False  # continue the run in --out, with its options; without --out the latest numbered folder
+    )
     envs: int | None = None  # worker processes, which change no result (default: one per core)
     device: str = "cpu"  # device of networks and data, such as cuda; under torchrun each process has its own
     videos: bool = True  # save a filmstrip and a video of one episode per method
