@@ -102,6 +102,7 @@ def test_what_everyone_sets_comes_first(helps):
     order[2] = "sources"
     for name in ("robomimic", "pusht", "joint_targets", "mimicgen_tasks", "chunking", "navigation1d"):
         assert groups(helps[name]) == order, name
+        assert next(iter(options_of(helps[name]))) == "--preset", name
 
 
 def test_a_reader_who_has_seen_enough_is_no_error():

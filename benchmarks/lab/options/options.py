@@ -113,10 +113,6 @@ class Evaluation:
 class Run:
     """Options of the computation, and of what it writes."""
 
-    # defaults of the other options: quick, cpu, paper, or much-ado (paper, with the details of the public
-    # code that the paper may build on); navigation1d.py has quick and paper; prior_space_rl.py has quick,
-    # unit and paper
-    preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered folder under runs/)
     resume: bool = (
         False  # continue the run in --out, with its options; without --out the latest numbered folder
@@ -160,6 +156,10 @@ class Options:
     evaluation: Annotated[Evaluation, Flat] = field(default_factory=Evaluation)
     run: Annotated[Run, Flat] = field(default_factory=Run)
     network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
+    # values of all options that are not given: quick, cpu, paper, or much-ado (paper, with the details of the
+    # public code that the paper may build on); navigation1d.py has quick and paper; prior_space_rl.py has
+    # quick, unit and paper
+    preset: str = "quick"
 
     @property
     def name(self) -> str:
