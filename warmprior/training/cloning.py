@@ -199,7 +199,7 @@ class BehaviourCloning:
             self._keep()
             if changes and description is not None:
                 place = self.policy_path(self.iteration)
-                tqdm.write(f"{place} was trained before; its weights stay, and {changes}", file=sys.stderr)
+                tqdm.write(f"{place} was trained before; its weights stay ({changes})", file=sys.stderr)
         save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
         self.actor.train()
         bar = progress_bar(
