@@ -46,6 +46,7 @@ def main(argv: list[str] | None) -> None:
     add("--out", type=Path, help="HDF5 file to write, which may be FILE itself (default: in the cache)")
     add("--workers", type=int, help="number of processes (default: one per core)")
 
+    argv = (sys.argv[1:] if argv is None else argv) or ["--help"]
     args = read_command_line(lambda: parser.parse_args(argv))
     from lab.demonstrations.downloads import download_robomimic
     from lab.demonstrations.render import render_demonstrations

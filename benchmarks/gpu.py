@@ -88,13 +88,14 @@ class GpuOptions:
         """Return the preset's policies for a number of iterations; encoders start from random weights."""
         from lab.running.policies import policies_of
 
-        changes: dict[str, dict[str, Any]] = {
+        changes: dict[str, Any] = {
             "data": {"obs": obs, "demonstrations": (DEMONSTRATIONS[obs],)},
             "network": {"encoder": "resnet18"},
             "training": {"iterations": iterations, "checkpoints": 1, "log_every": max(1, self.probe // 3)},
             "sources": {"prior": self.prior[:1] if first else self.prior},
             "evaluation": {"seeds": 1, "episodes": self.episodes},
-            "run": {"preset": self.preset, "device": self.device, "out": self.out / obs / "run"},
+            "preset": self.preset,
+            "run": {"device": self.device, "out": self.out / obs / "run"},
         }
         changes["run"]["compile"] = self.device != "cpu"
         options = adapted(PRESETS[self.preset], with_parts(PRESETS[self.preset], **changes))

@@ -111,7 +111,7 @@ BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
 
 def adapt(preset: AgentsOptions, typed: AgentsOptions) -> AgentsOptions:
     """Return the preset with the hyper-parameters of the task."""
-    name, tasks, run = typed.run.preset, typed.data.task, typed.policies
+    name, tasks, run = typed.preset, typed.data.task, typed.policies
     if name == "unit":
         return preset
     if run is not None and (run / "tasks.json").exists():

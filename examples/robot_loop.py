@@ -36,8 +36,6 @@ PATIENCE = 1.0
 DELAY = 0.05
 """The longest expected decision, in seconds."""
 
-CHUNK, NFE = 8, 3
-
 
 class Robot(Protocol):
     """The methods of a robot that the loop calls."""
@@ -216,8 +214,8 @@ def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
     seeing: dict[str, Any] = {"encoder": "small", "crop_size": 28} if camera else {}
     return train_policy(
         demonstrations(camera, rate),
-        PastPrior(CHUNK, correlation=0.5),
-        nfe=NFE,
+        PastPrior(8, correlation=0.5),
+        nfe=3,
         network=NetworkOptions(hidden_dim=128, **seeing),
         training=TrainingConfig(iterations=iterations),
         description=None,
@@ -231,7 +229,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Read the options of the command line, play, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     add = parser.add_argument
-    add("--rate", type=float, default=50.0, help="control steps per second (default: %(default)s)")
+    add(
+        "--rate",
+        type=float,
+        default=50.0,
+        help="control steps per second, where the policy names none (default: %(default)s)",
+    )
     add("--seconds", type=float, default=10.0, help="seconds of the episode (default: %(default)s)")
     add("--camera", action="store_true", help="show the policy the goal only by a camera")
     add("--decision", type=float, default=0.0, help="extra seconds per decision (default: %(default)s)")
@@ -253,9 +256,11 @@ def play(options: argparse.Namespace) -> None:
     policy = trained(options.camera, options.rate, options.iterations)
     policy.register_forward_pre_hook(lambda module, inputs: time.sleep(options.decision))
     robot = SimulatedArm(options.camera, options.unplug)
-    record = run(robot, policy, options.rate, options.seconds)
-    print(f"NFE {NFE}, {CHUNK} actions per chunk, {'camera' if options.camera else 'no camera'}")
-    print(record.report(1 / options.rate))
+    recorded = None if policy.recording is None else policy.recording.rate
+    rate, seen = recorded or options.rate, "camera" if options.camera else "no camera"
+    record = run(robot, policy, rate, options.seconds)
+    print(f"NFE {policy.sampling.evaluations()}, {policy.prior.chunk_length} actions per chunk, {seen}")
+    print(record.report(1 / rate))
 
 
 if __name__ == "__main__":

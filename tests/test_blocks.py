@@ -41,6 +41,7 @@ def files(tmp_path, monkeypatch):
     monkeypatch.setattr(Prior, "classes", own)
 
 
+@pytest.mark.filterwarnings("error:The env passed to Collector")
 @pytest.mark.parametrize("text", [each for each in PROGRAMS if TRAINED not in each.values[0]])
 def test_a_program_runs(files, text):
     exec(compile(text, "block", "exec"), {"__name__": "__main__"})

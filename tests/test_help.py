@@ -1,5 +1,6 @@
 """Help is printed without PyTorch, whose import takes seconds; it says what happens instead of a None."""
 
+import importlib
 import json
 import os
 import re
@@ -59,6 +60,29 @@ def test_help_names_options_and_no_none(helps):
     assert not {name: lines for name, lines in found.items() if lines}
 
 
+def options_of(text):
+    """The options in their order, with their help."""
+    entries = [re.split(r"\boptions \W*\n", part)[0] for part in re.split(r"\n\W*(?=--[a-z])", text)[1:]]
+    return {entry.split()[0].rstrip(","): entry for entry in entries}
+
+
+def test_what_happens_without_an_option_is_said_once(helps):
+    entries = {
+        (name, option): each for name, text in helps.items() for option, each in options_of(text).items()
+    }
+    assert not [place for place, entry in entries.items() if len(re.findall(r"\bdefault\b", entry)) > 1]
+
+
+@pytest.mark.parametrize("name", ["warmprior.__main__", "demonstrations"])
+def test_without_a_command_the_help_is_shown(helps, name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module(name).main([])
+    assert not stop.value.code
+    asked, shown = (text.partition("\n")[2] for text in (helps[name], capsys.readouterr().out))
+    assert re.findall(r"\w+", asked) == re.findall(r"\w+", shown)  # the first line names the program
+
+
 def test_what_takes_seconds_is_said_before_it_begins(helps):
     """All scripts read their options by the same function."""
     assert helps["start"].splitlines()[0] == "importing PyTorch"
@@ -72,10 +96,13 @@ def groups(text):
 
 def test_what_everyone_sets_comes_first(helps):
     order = ["", "data", "source", "training", "evaluation", "run", "network"]
+    data = list(options_of(helps["warmprior.__main__ train"]))
+    assert data[0] == "--observations" and data.index("--images") < data.index("--image-size")
     assert groups(helps["warmprior.__main__ train"]) == order
     order[2] = "sources"
     for name in ("robomimic", "pusht", "joint_targets", "mimicgen_tasks", "chunking", "navigation1d"):
         assert groups(helps[name]) == order, name
+        assert next(iter(options_of(helps[name]))) == "--preset", name
 
 
 def test_a_reader_who_has_seen_enough_is_no_error():

@@ -1,3 +1,4 @@
+import re
 import shlex
 import shutil
 import sys
@@ -19,6 +20,7 @@ from warmprior.evaluation import play_episode
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
+from warmprior.training.gradient_step import GradientStep
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
@@ -153,7 +155,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         assert not missing(refused(argv, capsys), fact)
 
 
-def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
+def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys, monkeypatch):
     path, out = tmp_path / "lift.hdf5", tmp_path / "my runs"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     argv = ["train", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
@@ -166,8 +168,23 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     assert main(["info", folder]) == 0
     assert "PastPrior(chunk_length=8, sigma=0.3, correlation=0.5)" in capsys.readouterr().out
     written = {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")}
-    assert main(small) == 0  # there is nothing to do
+    compiled = []
+    monkeypatch.setattr(GradientStep, "compile", lambda update: compiled.append(update))
+    assert main([*small, "--compile"]) == 0 and compiled  # there is nothing to do
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
+    for words, facts in (
+        ("--iterations 4 --hidden-dim 9", ("iterations was 2 and is 4", "hidden_dim was 8 and is 9")),
+        ("--network plain_mlp --no-precondition", ("network was PreconditionedNetwork and is",)),
+        ("--demonstrations 1", ("demonstrations",)),
+    ):
+        assert main([*small, *words.split()]) == 2
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert not missing(said, *facts, "--out") and "buffers" not in said
+        assert not re.search(r"\b[0-9a-f]{16}\b", said)  # no digest
+    assert load_policy(folder).sampling.nfe == 3
+    assert main([*small, "--nfe", "1"]) == 0
+    assert load_policy(folder).sampling.nfe == 1
+    assert not missing(capsys.readouterr().err, folder, "nfe was 3 and is 1")
 
 
 def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):

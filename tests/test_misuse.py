@@ -97,7 +97,7 @@ def test_a_training_is_of_its_units(tmp_path):
     """The same data in other units look alike once they are normalised."""
     data = steps()
     train_policy(data, PRIOR, tmp_path / "run", **SHORT)
-    with raises(ValueError, "another policy"):
+    with raises(ValueError, "demonstrations"):
         doubled = data.apply(lambda value: value * 2 if value.is_floating_point() else value)
         train_policy(doubled, PRIOR, tmp_path / "run", **SHORT)
 

@@ -12,6 +12,7 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
 
 
+@pytest.mark.filterwarnings("error:The env passed to Collector")
 @pytest.mark.parametrize("iterations", [20, pytest.param(1_000, marks=pytest.mark.slow)])
 def test_the_programs_print_what_the_pages_say(tmp_path, monkeypatch, capsys, iterations):
     monkeypatch.chdir(tmp_path)
@@ -21,6 +22,7 @@ def test_the_programs_print_what_the_pages_say(tmp_path, monkeypatch, capsys, it
         first = first.replace("1_000", str(iterations)).replace("[256]", "[8]").replace("(100,", "(20,")
     scope: dict = {}
     exec(compile(first, "quickstart", "exec"), scope)
+    assert not scope["runs"]["vla_action", "chunk"].requires_grad
     found, (shown,) = capsys.readouterr().out.splitlines(), blocks("docs/quickstart.md", "text")
     lines = shown.splitlines()
     assert [re.split(r" \d+% ", line) for line in found] == [re.split(r" \d+% ", line) for line in lines]

@@ -43,6 +43,13 @@ def _policy(folder: str, revision: str | None, modules: Sequence[str]) -> WarmPr
     return load_policy(folder, revision=revision)
 
 
+def _wanted(name: str, shape: Sequence[int]) -> str:
+    """Return in words what a robot has to give a policy under a name."""
+    if len(shape) == 3:
+        return f"{name} (any size, resized to {shape[1]} x {shape[2]})"
+    return f"{name} {tuple(shape)}"
+
+
 def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = ()) -> None:
     """Print what a saved policy needs, does and was trained on.
 
@@ -63,7 +70,7 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
     file = policy_file(folder, revision=revision)
     for name, value in {
-        "takes": "unknown" if shapes is None else ", ".join(f"{k} {v}" for k, v in shapes.items()),
+        "takes": "unknown" if shapes is None else ", ".join(map(_wanted, shapes, shapes.values())),
         **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
         "source": actor.prior,
         "start": actor.start or "the source",
@@ -269,29 +276,29 @@ class Data(Resizing):
 
     Attributes:
         observations: observations of the policy, in this order; by default the task's
+        images: images of the policy, in addition to the robot's state, such as agentview_image
+        demonstrations: number of demonstrations, from the first on; by default all
+        mask: mask of the file, such as train, whose demonstrations to use; by default all
         joints: observation of the joint positions that absolute actions target; by default observation.state
             of a LeRobotDataset with the names of the actions, if the numbers are near; "" for none
-        images: images of the policy, in addition to the robot's state, such as agentview_image
-        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
         actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
-        mask: mask of the file, such as train, whose demonstrations to use; by default all
-        demonstrations: number of demonstrations, from the first on; by default all
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit; by default ph, and human
             outside robosuite
         horizon: control steps per episode; by default the environment's own, or robosuite's for the style
+        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
     """
 
     observations: tuple[str, ...] | None = None
-    joints: str | None = None
     images: tuple[str, ...] = ()
-    fast_rendering: bool = False
-    actions: Actions = "delta"
-    mask: str | None = None
     demonstrations: int | None = None
+    mask: str | None = None
+    joints: str | None = None
+    actions: Actions = "delta"
     task: str | None = None
     style: str | None = None
     horizon: int | None = None
+    fast_rendering: bool = False
 
 
 @dataclass(frozen=True)
@@ -300,11 +307,11 @@ class Source:
 
     Attributes:
         prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
-            in past,sigma=0.3
+            in past,sigma=0.3; by default past,correlation=0.5, or gaussian if actions are absolute targets
         chunk: chunk length H
     """
 
-    prior: str = "past,correlation=0.5"
+    prior: str | None = None
     chunk: int = 8
 
 
@@ -329,10 +336,12 @@ class Run:
     Attributes:
         out: folder of training runs, in which an interrupted one continues
         device: device of the network, such as cuda
+        compile: train with torch.compile, which needs a C++ compiler
     """
 
     out: Path = Path("policies")
     device: str = "cpu"
+    compile: bool = False
 
 
 def train(
@@ -347,6 +356,9 @@ def train(
     network: NetworkOptions,
 ) -> None:
     """Train a policy on demonstrations, without playing episodes.
+
+    $ python -m warmprior train square.hdf5 --iterations 20000
+    $ python -m warmprior train lerobot:USER/NAME --images observation.images.front
 
     Args:
         place: a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a
@@ -368,7 +380,7 @@ def train(
     from warmprior.training.option_text import make
 
     check_device(run.device)  # before the demonstrations are read
-    prior, options = make(Prior, source.prior, source.chunk), source.prior.split(",")[1:]
+    make(Prior, source.prior or "gaussian", source.chunk)  # an error is better raised here
     sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
         place,
@@ -402,7 +414,9 @@ def train(
     if held_out is None:
         held_out = min(count - 1, max(1, count // 10)) if whole.environment is None else 0
     task, left_out = whole.split(held_out)
-    print(task.recording.text("--{}"), flush=True)
+    text = source.prior or ("past,correlation=0.5" if task.rest is None else "gaussian")
+    prior, options = make(Prior, text, source.chunk), text.split(",")[1:]
+    print(f"{task.recording.text('--{}')}\n{'source':13} {text} (--prior)", flush=True)
     name = f"{task.name}-{task.style}-{','.join([prior.name, *options])}-seed{training.seed}"
     actor = train_policy(
         task,
@@ -413,6 +427,7 @@ def train(
         network=network,
         training=training,
         device=run.device,
+        compile=run.compile,
         description=name,
     )
     saved = policy_path(run.out / name, training.iterations)
@@ -517,8 +532,8 @@ COMMANDS = (train, evaluate, info, improve, export, push, convert, observe)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run command-line arguments, and return the exit code. User errors are reported in one line."""
-    argv = sys.argv[1:] if argv is None else argv
-    if list(argv[:1]) == ["--version"]:
+    argv = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
+    if argv[0] == "--version":
         print(f"warmprior {version('warmprior')}")
         return 0
 
@@ -534,7 +549,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 config=(tyro.conf.OmitArgPrefixes,),  # --iterations, not --training.iterations
             )
         )
-        parsed()
+        from warmprior.saving.checkpoint import AnotherRunError
+
+        try:
+            parsed()
+        except AnotherRunError as error:
+            raise ValueError(f"{error} (--out)") from error
 
     return run_script(run, "warmprior")
 

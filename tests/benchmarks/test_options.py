@@ -2,6 +2,7 @@ import copy
 import json
 import os
 from dataclasses import replace
+from functools import reduce
 
 import budget
 import navigation1d
@@ -46,7 +47,7 @@ def test_options_survive_json(preset):
 def test_a_command_line_changes_what_it_says_alone(tmp_path):
     for name, preset in PRESETS.items():
         found = read("--preset", name, out=tmp_path)
-        assert replace(found, run=preset.run) == preset
+        assert found.preset == name and replace(found, run=preset.run, preset=preset.preset) == preset
     words = "--task can stack --style ph mh --demonstrations 7 9 --hidden-dim 32 --learning-rate 0.5"
     words += " --prior past --chunk 2 4 --sigma 0.1 0.2 --seeds 4 --seed 3 --nfe 1 5 --no-precondition"
     found = read(*words.split())
@@ -108,13 +109,14 @@ def test_an_option_that_a_file_lacks_is_no_default(tmp_path):
     record = {"study": "a-study", "options": recorded(read("--dataset", file, out=path.parent))}
     path.write_text(json.dumps(record))
     stored_options(Options, path.parent, "a-study")
-    for part, values in record["options"].items():
-        for name in values:
-            damaged = copy.deepcopy(record)
-            del damaged["options"][part][name]
-            path.write_text(json.dumps(damaged))
-            with raises(ValueError, "options.json", f"--{name.replace('_', '-')}"):
-                stored_options(Options, path.parent, "a-study")
+    options = record["options"]
+    places = [(part, name) for part, values in options.items() if isinstance(values, dict) for name in values]
+    for *part, name in ("preset",), *places:
+        damaged = copy.deepcopy(record)
+        del reduce(dict.get, part, damaged["options"])[name]
+        path.write_text(json.dumps(damaged))
+        with raises(ValueError, "options.json", f"--{name.replace('_', '-')}"):
+            stored_options(Options, path.parent, "a-study")
 
 
 def test_each_training_seed_has_start_states_of_its_own():

@@ -128,7 +128,7 @@ def test_the_recipe_from_images(monkeypatch):
     preset = mimicgen_tasks.FEW["paper"]
     assert evaluation(preset) == facts.EVALUATION
     monkeypatch.setattr("warmprior.modules.encoder.imagenet_weights", lambda: None)  # nothing is downloaded
-    asked = with_parts(preset, data={"download": True}, run={"preset": "paper"})
+    asked = with_parts(preset, preset="paper", data={"download": True})
     adapted = mimicgen_tasks.adapt(preset, asked)
     assert recipe(preset) == recipe(adapted) == facts.TABLE_3["mimicgen"]
     assert [(task, *adapted.data.style) for task in adapted.data.task] == list(MIMICGEN.values())
@@ -167,7 +167,7 @@ def test_the_preset_of_the_public_code_from_images(monkeypatch):
         assert unlike_the_paper(presets) == facts.MUCH_ADO | facts.MUCH_ADO_ENCODER
         assert presets["much-ado"].data.actions == "delta"
     read = parse(PRESETS, argv, "robomimic", None)
-    assert with_parts(read, run=vars(adapted["much-ado"].run)) == adapted["much-ado"]
+    assert with_parts(read, preset="quick", run=vars(adapted["much-ado"].run)) == adapted["much-ado"]
     network = make_network(read.network, 7, 9, 8, {"agentview_image": 84})
     observation_layers = network.network.observation_layers
     assert (observation_layers, network.encoder.backbone) == (2, "resnet18")

@@ -14,7 +14,7 @@ from lab.options.command_line import parse, started
 from lab.options.presets import PRESETS
 from lab.reporting import report
 from tests.benchmarks.script_parts import is_png
-from tests.errors import raises
+from tests.errors import missing, raises
 from tests.paper_facts import SIGMA_SUCCESS, SUCCESS
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
@@ -186,6 +186,8 @@ def test_the_report_has_the_layout_of_table_1():
     halves = pd.DataFrame([row("01"), row("11", prior="past"), row("01", prior="past", checkpoint=50)])
     assert counts(table(halves, 2))[1] == ("0.5", "0")
     assert "3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed" in text
+    other = table(compared().assign(task="can"), source="scripted")  # the paper has no row of it
+    assert not missing(other, "Table 1", "transport", "docs/paper.md") and "official" not in other
     assert "- A note.\n" in text and "source_leak" not in text  # nobody measured it
 
 
@@ -218,6 +220,12 @@ def test_the_terminal_table_fits_and_says_first_what_came_out():
     both = pd.concat([compared(), compared().assign(task="can", policy=lambda rows: rows.policy + "-can")])
     sure = " ".join(report.headline(report.summary(both, 1), 1).split())
     assert "WP-Past solves 30.0 points more at NFE 1 (p = 0.031, 6 trainings)" in sure
+    lost = report.summary(
+        pd.DataFrame([row(0, prior=p, nfe=n) for p in ("gaussian", "past") for n in (9, 1)]), 1
+    )
+    assert not missing(report.headline(lost, 1), "No method solves") and "Best" not in report.headline(
+        lost, 1
+    )
     names = [f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(14)]
     rows = [row(prior="past", options=o, nfe=n, task=t) for o in names for n in range(1, 10) for t in "ab"]
     text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import missing, raises
 from tests.toy_env import mlp_actor
 from warmprior import PastPrior
 from warmprior.deploy import AsyncExecutor
+from warmprior.modules.recording import Recording
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "robot_loop.py"
 
@@ -171,6 +172,15 @@ def test_demonstrations_are_what_the_arm_shows(example, camera):
         image = observation["front_image"]
         assert image.shape[1:] == (3, 32, 32) and image.dtype == torch.uint8
         assert seen["front_image"].dtype == np.uint8
+
+
+def test_the_numbers_of_a_policy_are_printed(example, clock, monkeypatch, capsys):
+    recording = Recording("arm", 1, 9, "[2], as recorded", {"state": 4}, rate=25)
+    mine = mlp_actor(PastPrior(4), observation_dim=4, nfe=2, recording=recording)
+    monkeypatch.setattr(example, "trained", lambda *options: mine)
+    assert example.main(["--seconds", "1"]) == 0
+    said = capsys.readouterr().out
+    assert not missing(said, "NFE 2", "4 actions", "period 40.0 ms", "25 steps")
 
 
 FEW = ("--seconds", "2", "--iterations", "5")

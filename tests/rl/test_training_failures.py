@@ -15,10 +15,10 @@ def test_a_state_of_something_else_is_refused(tmp_path):
     make_training(tmp_path, environment_steps=30).run()
     files = {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")}
     for part, options in {
-        "config": {"gamma": 0.5},
-        "prior": {"actor": make_actor(PastPrior(H, sigma=0.25))},
+        "gamma": {"gamma": 0.5},
+        "sigma": {"actor": make_actor(PastPrior(H, sigma=0.25))},
         "policy": {"actor": make_actor(seed=1)},
-        "sampling": {"actor": make_actor().replace(clip=0.5)},
+        "clip": {"actor": make_actor().replace(clip=0.5)},
         "start": {"actor": make_actor().replace(start=Halfway())},
         "environment": {"actor": make_actor().replace(environment={"env_name": "Other"})},
         "evaluation_seed": {"collection": {"evaluation_seed": 7}},

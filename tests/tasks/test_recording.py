@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.errors import missing, raises
-from warmprior import PastPrior
+from warmprior import GaussianPrior, PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
 from warmprior.deploy import AsyncExecutor
@@ -53,7 +53,7 @@ def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, 
     assert said["images"] == "none"
     assert not missing(said["left_out"], "robot0_ft (--observations)", "wrist (--images)", "depth (no option")
     assert not missing(said["actions"], "[3]", "recorded")
-    assert not missing(said["data"], "arm.hdf5", "2 demonstrations", "27 steps")
+    assert not missing(said["data"], "arm.hdf5", "2 of 3 demonstrations", "1 held out", "27 steps")
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,11 @@ def test_absolute_joint_targets_are_recognised_said_and_saved(tmp_path, capsys):
     words = ["train", place, "--iterations", "1", "--hidden-dim", "8", "--out", str(tmp_path)]
     assert main(words) == 0
     *said, folder = capsys.readouterr().out.splitlines()
-    assert not missing(lines_of("\n".join(said[:5]))["actions"], "[6]", "observation.state")
+    lines = lines_of("\n".join(said[:7]))
+    assert not missing(lines["actions"], "[6]", "observation.state")
+    assert not missing(lines["data"], "1 of 2 demonstrations, 1 held out")
+    assert not missing(lines["source"], "gaussian", "--prior")
+    assert isinstance(load_policy(folder).prior, GaussianPrior)  # what which_source.md advises
     assert load_policy(folder).network.trend.rest.columns.tolist() == list(range(6))
     by_hand = Task(open_demonstrations(place), joints="observation.state")
     assert Task(open_demonstrations(place)).identity == by_hand.identity
@@ -214,7 +218,7 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert main(["info", folder]) == 0
     said = lines_of(capsys.readouterr().out.replace("written by", "written_by"))
     assert said["observations"] == "observation.state [6], observation.effort [2]"
-    assert not missing(said["takes"], "state (8,)", "front_image (3, 32, 32)")
+    assert not missing(said["takes"], "state (8,)", "front_image", "any size", "32 x 32")
     assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
     assert not missing(said["data"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
 

@@ -17,15 +17,15 @@ from warmprior.saving.checkpoint import load_state
 def test_a_state_of_another_run(tmp_path):
     finished(tmp_path)
     before = (tmp_path / "state.safetensors").read_bytes()
-    for part, change in (
-        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
-        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
-        ("prior", {"actor": actor_for(PastPrior(4, sigma=0.1))}),
-        ("prior", {"actor": actor_for(PreviewPrior(4))}),
-        ("network", {"actor": actor_for(network=mlp())}),
-        ("data", {"data": dataset().set("action", torch.zeros(120, 2))}),
+    for difference, change in (
+        ("learning_rate was", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
+        ("seed was 0 and is 1", {"config": dataclasses.replace(CONFIG, seed=1)}),
+        ("sigma was 0.5 and is 0.1", {"actor": actor_for(PastPrior(4, sigma=0.1))}),
+        ("prior was past and is preview", {"actor": actor_for(PreviewPrior(4))}),
+        ("network was", {"actor": actor_for(network=mlp())}),
+        ("demonstrations", {"data": dataset().set("action", torch.zeros(120, 2))}),
     ):
-        with raises(ValueError, part):
+        with raises(ValueError, difference):
             training(tmp_path, **change)
         assert (tmp_path / "state.safetensors").read_bytes() == before
 

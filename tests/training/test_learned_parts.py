@@ -147,7 +147,7 @@ def test_what_another_run_learnt_is_refused(tmp_path):
     for fact, changes in (
         ("seed", {"training": dataclasses.replace(CONFIG, seed=1)}),
         ("hidden_dim", {"prior": CVAEPrior(H, hidden_dim=16)}),
-        ("data", {"data": steps(11)}),
+        ("demonstrations", {"data": steps(11)}),
         ("observation_steps", {"network": dataclasses.replace(NETWORK, observation_steps=2)}),
     ):
         with raises(ValueError, "prior.safetensors", fact):

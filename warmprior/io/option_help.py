@@ -1,14 +1,15 @@
-"""Help of options: an option that has no default says in words what happens without it, and shows none."""
+"""Help of options: they stand in the order of the constructor, and say once what happens without them."""
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, get_type_hints
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 registry = ConstructorRegistry()
 """The rule for dataclasses, which ``tyro.cli`` takes."""
@@ -20,9 +21,15 @@ def _shown(default: str) -> str:
     return "" if default in ("None", "") else f"(default: {default})"
 
 
-def _option(kind: Any) -> Any:
-    """Return the type of an option whose help names neither ``None`` nor an empty default."""
-    return Annotated[kind, tyro.conf.DisallowNone, tyro.conf.arg(help_behavior_hint=_shown)]
+def _option(kind: Any, words: str = "") -> Any:
+    """Return the type of an option whose help names no ``None``, and no default that its ``words`` name."""
+    hint: Any = "" if re.search(r"\bdefault\b", words) else _shown
+    return Annotated[kind, tyro.conf.DisallowNone, tyro.conf.arg(help_behavior_hint=hint)]
+
+
+def _words(field: StructFieldSpec) -> str:
+    text = field.helptext() if callable(field.helptext) else field.helptext
+    return text or ""
 
 
 @registry.struct_rule
@@ -36,7 +43,9 @@ def _fields_of(info: StructTypeInfo) -> StructConstructorSpec | None:
         _reading.pop()
     if not isinstance(spec, StructConstructorSpec):
         return None
-    return replace(spec, fields=tuple(replace(field, type=_option(field.type)) for field in spec.fields))
+    order = list(inspect.signature(info.type).parameters)  # what is given by keyword alone comes last
+    fields = sorted(spec.fields, key=lambda field: order.index(field.name))
+    return replace(spec, fields=tuple(replace(f, type=_option(f.type, _words(f))) for f in fields))
 
 
 def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:

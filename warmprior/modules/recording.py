@@ -18,7 +18,7 @@ class Recording:
 
     Attributes:
         name: name of the demonstrations.
-        demonstrations: their number.
+        demonstrations: their number, without those held out.
         steps: their number of steps.
         actions: what the actions are, in words.
         observations: the width of each observation, in the order of the policy's vector.
@@ -26,6 +26,7 @@ class Recording:
         names: the dataset's own names of images that have another here.
         left_out: what the policy does not see, by the option that would take it, or under no name.
         rate: control steps per second, if they are known.
+        held_out: number of further demonstrations that are held out.
 
     Raises:
         ValueError: if an entry has another form.
@@ -51,10 +52,11 @@ class Recording:
     names: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
     rate: float | None = None
+    held_out: int = 0
 
     def __post_init__(self) -> None:
-        counts = {"demonstrations": self.demonstrations, "steps": self.steps, **self.observations}
-        check_whole_numbers(0, **counts)
+        counts = {"demonstrations": self.demonstrations, "steps": self.steps, "held_out": self.held_out}
+        check_whole_numbers(0, **counts, **self.observations)
         check_positive(**given(rate=self.rate))
         texts = *self.images.values(), *self.names.values(), *chain(*self.left_out.values())
         if not all(isinstance(text, str) for text in (self.name, self.actions, *texts)):
@@ -66,9 +68,10 @@ class Recording:
             f"{', '.join(names)} ({option.format(taken_by) if taken_by else 'no option takes it'})"
             for taken_by, names in self.left_out.items()
         ]
-        demonstrations = (
-            "1 demonstration" if self.demonstrations == 1 else f"{self.demonstrations} demonstrations"
-        )
+        total = self.demonstrations + self.held_out
+        demonstrations = "1 demonstration" if total == 1 else f"{total} demonstrations"
+        if self.held_out:
+            demonstrations = f"{self.demonstrations} of {demonstrations}, {self.held_out} held out"
         hint = f" ({option.format('joints')} names what absolute joint targets set)"
         return {
             "data": f"{self.name}: {demonstrations}, {self.steps:,} steps",

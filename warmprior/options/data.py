@@ -14,7 +14,7 @@ IMAGE_SIZE = 84
 """The default side of images in pixels, as in the paper (Table 3)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Resizing:
     """The options of images' size.
 

@@ -34,7 +34,7 @@ class NetworkOptions:
     """The options of the velocity network.
 
     Attributes:
-        network: mlp is small, and the default; chi_transformer is the paper's, and plain_mlp that of its toy
+        network: mlp is small; chi_transformer is the paper's, and plain_mlp that of its toy
             task; adaln_transformer is a faster transformer (adaptive layer norm).
         hidden_dim: width of the network; the class's own by default.
         precondition: use the second moments of source and data, see PreconditionedNetwork.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -63,14 +63,8 @@ class PriorSpaceAgent:
         drawn: Literal["clipped"] | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
-        sizes: dict[str, Any] = {name: getattr(actor.network, name, None) for name in names}
-        if missing := [name for name, size in sizes.items() if size is None]:
-            kind = type(actor.network).__name__
-            raise TypeError(
-                f"an agent needs the policy's {', '.join(missing)}: make {kind} a VelocityNetwork"
-            )
-        sizes |= {"hidden_dim": config.hidden_dim, "num_layers": config.num_layers}
+        layers = {"hidden_dim": config.hidden_dim, "num_layers": config.num_layers}
+        sizes = self.decoder.sizes | layers
         network = make_prior_space_actor(**sizes, delta=self.decoder.delta, in_keys=self.state_keys)
         self.network = network.to(self.device)
         self.policy = TensorDictSequential(self.network, self.decoder)

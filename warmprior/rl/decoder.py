@@ -89,6 +89,21 @@ class PriorDecoder(TensorDictModuleBase):
         """The frozen network."""
         return self.ode.network
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The policy's sizes, as arguments of :func:`make_prior_space_actor` and its critics.
+
+        Raises TypeError if the network does not have them.
+        """
+        names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
+        sizes: dict[str, Any] = {name: getattr(self.network, name, None) for name in names}
+        if missing := [name for name, size in sizes.items() if size is None]:
+            kind = type(self.network).__name__
+            raise TypeError(
+                f"an agent needs the policy's {', '.join(missing)}: make {kind} a VelocityNetwork"
+            )
+        return sizes
+
     @dispatch(auto_batch_size=False)
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

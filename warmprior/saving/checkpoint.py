@@ -98,19 +98,56 @@ def restoring(path: Path) -> Iterator[None]:
         ) from error
 
 
+class AnotherRunError(ValueError):
+    """The error of a folder that holds another run, which other options would continue."""
+
+
 def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None:
-    """Raise ValueError if a state belongs to another run, with the first part that differs."""
-    stored = stored if isinstance(stored, dict) else {}
-    for part, value in as_json(expected).items():
-        saved = stored.get(part)
-        if saved != value:
-            if isinstance(saved, dict) and isinstance(value, dict):  # name only the options that differ
-                keys = [key for key in {**saved, **value} if saved.get(key) != value.get(key)]
-                saved, value = ({key: each.get(key) for key in keys} for each in (saved, value))
-            raise ValueError(
-                f"{path} belongs to another {part}: it has {saved}, this run has {value}. Use the same "
-                "options, or another output folder."
-            )
+    """Raise AnotherRunError, with what differs, if a state belongs to another run."""
+    stored, expected = stored if isinstance(stored, dict) else {}, as_json(expected)
+    if any(stored.get(part) != value for part, value in expected.items()):
+        raise AnotherRunError(
+            f"{path} belongs to a run with other options ({differences(stored, expected)}): repeat its "
+            "options, or choose another folder"
+        )
+
+
+DIGESTS = {
+    "data": "the demonstrations, or what is read of them, differ",
+    "policy": "the policy differs",
+    "buffers": "what was computed from the demonstrations differs",
+}
+"""What the digests of a configuration stand for; the last one mostly follows from other differences."""
+
+
+def differences(before: Any, now: Any) -> str:
+    """Return in words what differs between two configurations of JSON.
+
+    Examples:
+        >>> from warmprior.saving.checkpoint import differences
+        >>> before = {"prior": {"name": "past", "sigma": 0.5}, "device": "cpu", "data": "fd6a7b78"}
+        >>> differences(before, before | {"prior": {"name": "past", "sigma": 0.3}, "data": "4b6c497c"})
+        'sigma was 0.5 and is 0.3; the demonstrations, or what is read of them, differ'
+        >>> differences(before, before | {"prior": {"name": "gaussian"}})
+        'prior was past and is gaussian'
+    """
+    found = {
+        name: DIGESTS[name] if name in DIGESTS and isinstance(old, str) else f"{name} was {old} and is {new}"
+        for name, old, new in _leaves("", before, now)
+    }
+    return "; ".join(text for name, text in found.items() if name != "buffers" or len(found) == 1)
+
+
+def _leaves(name: str, before: Any, now: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the options that differ; objects of two classes differ by the name of their class alone."""
+    are_parts = isinstance(before, dict) and isinstance(now, dict)
+    if are_parts and before.get("name") == now.get("name"):
+        for key in {**before, **now}:
+            if before.get(key) != now.get(key):
+                yield from _leaves(key, before.get(key), now.get(key))
+    else:
+        old, new = (each.get("name", each) if isinstance(each, dict) else each for each in (before, now))
+        yield name, old, new
 
 
 def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:

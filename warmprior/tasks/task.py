@@ -345,7 +345,8 @@ class Task:
         part.__dict__.pop("identity", None)
         part.data = self.data[kept]
         sizes: dict[str, Any] = {"demonstrations": len(numbers) - held_out, "steps": len(part.data)}
-        part.facts, part.recording = self.facts | sizes, replace(self.recording, **sizes)
+        part.facts = self.facts | sizes
+        part.recording = replace(self.recording, **sizes, held_out=held_out)
         part.digest = None if self.digest is None else digest_of(self.digest, held_out)
         return part, self.data[left_out]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -12,6 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.record.loggers.common import Logger
+from tqdm import tqdm
 
 from warmprior.checks import check_finite
 from warmprior.io.distributed import check_batch, from_leader, rank, wait_for_leader, world_size
@@ -24,6 +26,7 @@ from warmprior.objectives.flow_matching import Coupling
 from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     RunState,
+    differences,
     fixed_identity,
     named,
     restore_rng,
@@ -175,7 +178,7 @@ class BehaviourCloning:
             BlockingIOError: if another process is training in the folder.
             OSError: if the folder cannot be written to.
         """
-        if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
+        if from_leader(lambda: self.iteration == self.config.iterations and self._changes() == ""):
             return
         from_leader(lambda: check_writable(self.directory))
         with exclusive(self.directory) if not self.rank else nullcontext():
@@ -192,8 +195,11 @@ class BehaviourCloning:
     def _run(self, description: str | None, progress: Callable[[int], object] | None) -> None:
         config = self.config
         keep = set(config.checkpoint_iterations)
-        if self.iteration in keep and not self.rank and not self._is_kept():
+        if self.iteration in keep and not self.rank and (changes := self._changes()) != "":
             self._keep()
+            if changes and description is not None:
+                place = self.policy_path(self.iteration)
+                tqdm.write(f"{place} was trained before; its weights stay ({changes})", file=sys.stderr)
         save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
         self.actor.train()
         bar = progress_bar(
@@ -224,15 +230,16 @@ class BehaviourCloning:
         """Keep the policy of this iteration."""
         save_policy(self.update.averaged(self.actor), self.policy_path(self.iteration))
 
-    def _is_kept(self) -> bool:
-        """Return True if the policy of this iteration is on disk, complete, and acts as this run's does."""
+    def _changes(self) -> str | None:
+        """Return how this run's policy acts otherwise than that on disk; ``None`` if none is complete."""
         try:
             with torch.random.fork_rng([]):  # loading a policy first draws random weights
                 kept = policy_config(load_policy(self.policy_path(self.iteration)))
         except (OSError, ValueError):
-            return False
-        asked = policy_config(self.actor)
-        return all(kept[part] == asked[part] for part in ("actor", "environment"))
+            return None
+        parts = ("actor", "environment")
+        before, now = ({part: each[part] for part in parts} for each in (kept, policy_config(self.actor)))
+        return differences(before, now)
 
     def _check_finite(self) -> None:
         # Checked before every save, and not only before logs: a run cannot resume from a saved NaN.

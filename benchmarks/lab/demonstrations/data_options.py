@@ -70,8 +70,8 @@ class DataOptions(Resizing):
     """Options of the demonstrations that policies are trained on.
 
     Attributes:
-        task: tasks of robosuite (default: can in the quick preset, otherwise square, or the dataset's), or
-            package.module:function of your own, which takes these options and returns a Task
+        task: tasks of robosuite, or package.module:function of your own, which takes these options and
+            returns a Task (default: can in the quick preset, otherwise square, or the dataset's)
         style: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
             source (human) or core (generated from source)
         dataset: demonstrations in place of generated ones: a robomimic HDF5 file or a folder of them,
@@ -80,8 +80,8 @@ class DataOptions(Resizing):
         force_download: download the official demonstrations again, in place of a broken local copy
         mask: mask of the file, such as train, whose demonstrations to use (default: all)
         horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
-        demonstrations: number of demonstrations to generate, or to take from a file (default: all of it); two
-            numbers for ph and mh
+        demonstrations: number of demonstrations to generate, or to take from a file, which is taken whole if
+            none is given; two numbers for ph and mh
         actions: actions of the policies: deltas as recorded, or the absolute poses that they target
         obs: observations of the policies: state of robot and objects, or state of the robot and images
         observations: observations of the policies, in this order, of --dataset (default: the task's)

@@ -94,7 +94,7 @@ class AgentsOptions(Options):
         check_counts(self, "num_envs", "collectors")
         if self.collectors is not None and self.collectors > 10:  # more would share seeds with other runs
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
-        if self.is_toy != (self.run.preset == "unit"):
+        if self.is_toy != (self.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "style", "chunk", "sigma", "nfe")
         check_given(self, "algorithm", "centre")

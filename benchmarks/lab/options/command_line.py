@@ -42,9 +42,9 @@ def parse[O: Options](
     """
     argv = sys.argv[1:] if argv is None else list(map(str, argv))
     typed = read(next(iter(presets.values())), argv, description)
-    if typed.run.preset not in presets:
-        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {typed.run.preset!r}")
-    base = presets[typed.run.preset]
+    if typed.preset not in presets:
+        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {typed.preset!r}")
+    base = presets[typed.preset]
     importable = (*argv, *base.sources.prior, *base.data.task)
     base = adapt(base, typed)
     if not typed.data.generated:  # a preset's number is for generated demonstrations
@@ -99,7 +99,7 @@ def output_folder(options: Options, study: str) -> Path:
     out, resume = options.run.out, options.run.resume
     if out is None:
         prefix = [] if study == "robomimic" else [study]
-        name = "-".join([*prefix, options.name, options.run.preset])
+        name = "-".join([*prefix, options.name, options.preset])
         taken = sorted(
             int(folder.name[len(name) + 1 :] or 1)
             for folder in Path("runs").glob(f"{escape(name)}*")

@@ -113,12 +113,10 @@ class Evaluation:
 class Run:
     """Options of the computation, and of what it writes."""
 
-    # defaults of the other options: quick, cpu, paper, or much-ado (paper, with the details of the public
-    # code that the paper may build on); navigation1d.py has quick and paper; prior_space_rl.py has quick,
-    # unit and paper
-    preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered folder under runs/)
-    resume: bool = False  # continue the run in --out, with its options (default: the latest default folder)
+    resume: bool = (
+        False  # continue the run in --out, with its options; without --out the latest numbered folder
+    )
     envs: int | None = None  # worker processes, which change no result (default: one per core)
     device: str = "cpu"  # device of networks and data, such as cuda; under torchrun each process has its own
     videos: bool = True  # save a filmstrip and a video of one episode per method
@@ -158,6 +156,10 @@ class Options:
     evaluation: Annotated[Evaluation, Flat] = field(default_factory=Evaluation)
     run: Annotated[Run, Flat] = field(default_factory=Run)
     network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
+    # values of all options that are not given: quick, cpu, paper, or much-ado (paper, with the details of the
+    # public code that the paper may build on); navigation1d.py has quick and paper; prior_space_rl.py has
+    # quick, unit and paper
+    preset: str = "quick"
 
     @property
     def name(self) -> str:

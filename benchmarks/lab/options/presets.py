@@ -73,9 +73,9 @@ def adapted[O: Options](preset: O, typed: Options) -> O:
     if "image" not in (typed.data.obs, preset.data.obs):
         return preset
     if preset.data.obs == "state":
-        changes = {part: dict(values) for part, values in IMAGES[typed.run.preset].items()}
+        changes = {part: dict(values) for part, values in IMAGES[typed.preset].items()}
         changes["data"] = {**changes.get("data", {}), "obs": "image"}
-        if typed.run.preset == "quick" and preset.data.task == PRESETS["quick"].data.task:
+        if typed.preset == "quick" and preset.data.task == PRESETS["quick"].data.task:
             changes["data"] |= {"task": ("lift",), "demonstrations": (100,)}
         preset = with_parts(preset, **changes)
     if preset.network.encoder == typed.network.encoder == PRETRAINED:

@@ -23,7 +23,7 @@ from lab.methods.methods import label
 from lab.options.options import Options, with_parts
 from lab.options.presets import IMAGES
 from lab.reporting.columns import COLUMNS, IDENTITY, column
-from lab.reporting.paper import paper_success
+from lab.reporting.paper import PAPER_SUCCESS, paper_success
 from lab.reporting.rows import read_rows
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
@@ -287,7 +287,7 @@ def _experiment(rows: DataFrame, top_k: int) -> str:
 
 
 def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
-    """Return three sentences: what the best methods gain, if it can be chance, and how much they solve.
+    """Return what the best methods gain, if it can be chance, how much they solve, and what was played.
 
     Over several settings, success is averaged, and trainings are taken together.
     """
@@ -298,7 +298,8 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
         totals = group.sort_index().groupby("method", sort=False).agg(sums)
         totals = totals[totals["task"] == totals["task"].max()]  # methods that were played in all settings
         name = totals["success"].idxmax()
-        best.append(f"{name} {totals.loc[name, 'success']:.1%} at {nfe}")
+        success = totals.loc[name, "success"]
+        best.append(f"{name} {success:.1%} at {nfe}" if success else f"none at {nfe}")
         others = totals.drop(first, errors="ignore")
         if first in totals.index and len(others):
             name = others["success"].idxmax()
@@ -307,9 +308,14 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
             more = f"{abs(gain) * 100:.1f} points {'fewer' if gain < 0 else 'more'}"
             chances.append(f"{name} solves {more} at {nfe} ({verdict(*gains)})")
     where = f"{len(settings)} settings ({', '.join(settings)})" if len(settings) > 1 else settings[0]
-    lines = [
+    found = [
         f"Compared with the {first}, {', '.join(chances) or 'nothing else was played in all settings'}.",
         f"Best success: {'; '.join(best)}.",
+    ]
+    if not rows["success"].max() > 0:
+        found = ["No method solves an episode, so nothing can be compared: train longer, or on more data."]
+    lines = [
+        *found,
         f"{counted(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
     ]
     return "\n".join(textwrap.fill(line, width, subsequent_indent="  ") for line in lines)
@@ -364,7 +370,12 @@ def success_report(
         )
     head = f"{_experiment(results, top_k)}. In parentheses: the gain over {first} in points. Bold: the best."
     listed = [head, rule, *notes]
-    if source not in ("official", None):
+    if results["paper"].isna().all():
+        tasks = ", ".join(dict.fromkeys(task for task, *_ in PAPER_SUCCESS))
+        listed.append(
+            f"The paper has no number for this experiment: its Table 1 has {tasks} (docs/paper.md)."
+        )
+    elif source not in ("official", None):
         listed.append(
             "The paper used the official human demonstrations; these are others. Compare gains within a row, "
             "not numbers across rows."
