@@ -21,6 +21,7 @@ from warmprior import (
     PreviewPrior,
     PriorAnchor,
     PriorDecoder,
+    ResidualSampler,
     WarmPriorActor,
     make_prior_space_actor,
 )
@@ -53,6 +54,26 @@ def test_euler_from_anchor_plus_delta(prior_class, shape):
     expected = a.clamp(-0.5, 0.5).reshape(expected_noise.shape)
     torch.testing.assert_close(out["vla_action", "chunk"], expected)
     assert (a.abs() > 0.5).any() and (a.abs() < 0.5).any()  # the clip matters
+
+
+@pytest.mark.parametrize("residuals", [1, 2])
+def test_residuals_are_held(residuals):
+    """One residual for two or four actions, as when each of them had been chosen alike."""
+    actor = make_actor(PastPrior(4), nfe=2)
+    data = batch(PastPrior(4), 5)
+    chosen = data["prior", "delta"][:, :residuals]
+    alike = torch.stack([chosen[:, i * residuals // 4] for i in range(4)], 1)
+    decoder = PriorDecoder(actor, delta=0.5, residual_length=residuals)
+    held = decoder(data.clone().set(("prior", "delta"), chosen))
+    expected = PriorDecoder(actor, delta=0.5)(data.set(("prior", "delta"), alike))
+    for key in expected["prior"].keys() - {"delta"}:
+        assert torch.equal(held["prior", key], expected["prior", key])
+    assert torch.equal(held["vla_action", "chunk"], expected["vla_action", "chunk"])
+    drawn = ResidualSampler(decoder)(data)["prior", "delta"]
+    networks = make_prior_space_actor(**decoder.sizes, delta=0.5)
+    assert networks(data)["prior", "delta"].shape == drawn.shape == (5, residuals, D_A)
+    with raises(ValueError, "residual_length (3)", "(4)"):
+        PriorDecoder(actor, delta=0.5, residual_length=3)
 
 
 @pytest.mark.parametrize("network", ["mlp", "transformer"])

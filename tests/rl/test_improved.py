@@ -49,6 +49,7 @@ CASES = {
     "gaussian": (GaussianPrior(H), {}),
     "learned": (Learned(H), {}),
     "sees history": (PastPrior(H), {"see_history": True}),
+    "one residual": (PastPrior(H), {}),
 }
 
 
@@ -61,7 +62,8 @@ def test_chunks_are_those_that_the_environment_of_the_agent_decodes(case, dtype)
     if case == "learned":
         with torch.no_grad():
             prior.shift.add_(0.3)
-    agent = make_agent(actor)
+    residual_length = 1 if case == "one residual" else None
+    agent = make_agent(actor, residual_length=residual_length)
     history = random_history(prior, 6)
     history = history.apply(lambda v: v.to(dtype) if v.is_floating_point() else v)
     data = TensorDict({keys.OBSERVATION: torch.randn(6, 1, WIDTH, dtype=dtype), keys.HISTORY: history}, [6])
@@ -71,7 +73,8 @@ def test_chunks_are_those_that_the_environment_of_the_agent_decodes(case, dtype)
 
     anchored = anchor_of(actor, data.clone(), noise)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        decided = TensorDictSequential(agent, PriorDecoder(actor.replace(nfe=1), delta=0.7))(anchored)
+        decoder = PriorDecoder(actor.replace(nfe=1), delta=0.7, residual_length=residual_length)
+        decided = TensorDictSequential(agent, decoder)(anchored)
         policy = improved_policy(actor, agent, nfe=1)
         start = policy.start(noise, data[keys.HISTORY], data[actor.observation_key])
         data.set(policy.sampler.out_keys[-1], start)

@@ -29,6 +29,8 @@ class PriorSpaceConfig:
         warmup_steps: control steps before any update, with residuals drawn from the prior and clipped to the
             box.
         delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
+        residual_length: the number ``R`` of residuals per chunk, each held for ``P / R`` actions; ``None``
+            for one per action.
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.
@@ -40,7 +42,7 @@ class PriorSpaceConfig:
         num_layers: number of hidden layers of actor and critics.
         backup_entropy: include the entropy in the targets of DSRL-NA's critic; those of SAC always do.
         alpha_init: initial temperature, 1 in DSRL. If success ends the episode, choose less than
-            ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
+            ``reward_offset * H / (R * d_a * log 2)``: otherwise the entropy of further decisions is worth
             more than success until the temperature has fallen.
         target_entropy: target of the entropy, in units of the box.
         reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
@@ -62,6 +64,7 @@ class PriorSpaceConfig:
     environment_steps: int = 1_000_000
     warmup_steps: int = 24_000
     delta: float | None = None
+    residual_length: int | None = None
     nfe: int = 1
     updates: int = 20
     noise_critic_steps: int = 10
@@ -89,7 +92,8 @@ class PriorSpaceConfig:
         check_between(0, 1, gamma=self.gamma, tau=self.tau)
         names = ["environment_steps", "warmup_steps", "nfe", "updates", "noise_critic_steps", "batch_size"]
         names += ["hidden_dim", "num_layers", "evaluate_every", "evaluation_episodes"]
-        check_whole_numbers(**{name: getattr(self, name) for name in names})
+        lengths = given(residual_length=self.residual_length)
+        check_whole_numbers(**{name: getattr(self, name) for name in names}, **lengths)
         if self.warmup_steps > self.environment_steps:
             raise ValueError(
                 f"warmup_steps ({self.warmup_steps}) exceed environment_steps ({self.environment_steps})"

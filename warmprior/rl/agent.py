@@ -58,7 +58,11 @@ class PriorSpaceAgent:
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
         self.config = config
         self.device = next(actor.parameters()).device
-        self.decoder = PriorDecoder(actor.replace(nfe=config.nfe), delta=delta_of(config, actor))
+        self.decoder = PriorDecoder(
+            actor.replace(nfe=config.nfe),
+            delta=delta_of(config, actor),
+            residual_length=config.residual_length,
+        )
         # By default, draws around a mean are clipped to the box, and draws around zero are not.
         drawn: Literal["clipped"] | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)

@@ -63,6 +63,11 @@ def residual_sigma(actor: Any) -> float:
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
+def held(delta: Tensor, length: int) -> Tensor:
+    """Return residuals ``[*B, R, d_a]``, each held for ``length / R`` actions, as ``[*B, length, d_a]``."""
+    return delta.repeat_interleave(length // delta.shape[-2], -2)
+
+
 class PriorAnchor(EnvTransform):
     r"""A transform that writes the anchor of agents, ``[*B, P, d_a]``: the mean, and noise where it is cold.
 

@@ -13,10 +13,10 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 from warmprior import keys
-from warmprior.checks import check_choice, check_keys, check_positive, check_shape
+from warmprior.checks import check_choice, check_keys, check_positive, check_shape, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.generator import Drawing
-from warmprior.rl.anchor import has_anchor, residual_sigma
+from warmprior.rl.anchor import has_anchor, held, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
 
@@ -26,7 +26,7 @@ class PriorDecoder(TensorDictModuleBase):
     An agent acts in the policy's source space through a bounded residual around an anchor,
 
     .. math::
-        a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{P \times d_a},
+        a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{R \times d_a},
 
     and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
     :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
@@ -41,10 +41,13 @@ class PriorDecoder(TensorDictModuleBase):
             :class:`~warmprior.lerobot.LeRobotActor`.
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
+        residual_length: the number ``R`` of residuals ``[*B, R, d_a]`` that the agent chooses, each held for
+            ``P / R`` actions; ``P`` by default. One residual per chunk shifts all of its actions together,
+            as DSRL does with large policies.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, or the policy is trained at ``t = 0`` only, is
-            guided, or has keys of its own.
+        ValueError: if ``delta`` is not a finite number > 0, ``residual_length`` does not divide ``P``, or the
+            policy is trained at ``t = 0`` only, is guided, or has keys of its own.
         KeyError: (when called) if an input key is missing.
 
     Examples:
@@ -60,7 +63,7 @@ class PriorDecoder(TensorDictModuleBase):
         (0.5, False)
     """
 
-    def __init__(self, actor: WarmPriorActor, *, delta: float) -> None:
+    def __init__(self, actor: WarmPriorActor, *, delta: float, residual_length: int | None = None) -> None:
         super().__init__()
         check_positive(delta=delta)
         check_usual_keys(actor, "PriorDecoder")
@@ -78,6 +81,13 @@ class PriorDecoder(TensorDictModuleBase):
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         self.requires_grad_(False).eval()
         self.prediction_length = actor.prior.prediction_length
+        self.residual_length = self.prediction_length if residual_length is None else residual_length
+        check_whole_numbers(residual_length=self.residual_length)
+        if self.prediction_length % self.residual_length:
+            raise ValueError(
+                f"residual_length ({self.residual_length}) must divide the prediction length "
+                f"({self.prediction_length})"
+            )
         #: The number ``d_a``, or ``None`` if the network does not have it.
         self.action_dim = getattr(actor.network, "action_dim", None)
         self.observation_key = self.ode.observation_key
@@ -102,7 +112,7 @@ class PriorDecoder(TensorDictModuleBase):
             raise TypeError(
                 f"an agent needs the policy's {', '.join(missing)}: make {kind} a VelocityNetwork"
             )
-        return sizes
+        return sizes | {"residual_length": self.residual_length}
 
     @dispatch(auto_batch_size=False)
     @torch.no_grad()
@@ -113,8 +123,10 @@ class PriorDecoder(TensorDictModuleBase):
         anchor, delta = tensordict.get(keys.ANCHOR), tensordict.get(keys.DELTA)
         chunk_shape = (self.prediction_length, self.action_dim or anchor.shape[-1])
         check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
-        check_shape(str(keys.DELTA), delta, anchor.shape)
-        noise = anchor + delta.to(anchor.dtype)  # the chunk is in the environment's precision
+        check_shape(str(keys.DELTA), delta, (*anchor.shape[:-2], self.residual_length, anchor.shape[-1]))
+        noise = anchor + held(delta, self.prediction_length).to(
+            anchor.dtype
+        )  # in the environment's precision
         inputs = tensordict.select(self.observation_key).set(keys.NOISE, noise)
         return tensordict.update(self.ode(inputs).select(*self.out_keys_source))
 
@@ -138,7 +150,7 @@ class PriorDecoder(TensorDictModuleBase):
 
 
 class PriorSpace(EnvTransform):
-    r"""A transform with the residual as action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
+    r"""A transform with the residual as action: :math:`\Delta \in [-\delta, \delta]^{R \times d_a}`.
 
     It is the other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
     environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
@@ -198,8 +210,10 @@ class PriorSpace(EnvTransform):
         self.decoder.check_env(self.parent)
         actions = input_spec["full_action_spec"]
         leaf, delta = actions[keys.CHUNK], self.decoder.delta
+        *batch, _, width = leaf.shape
         # In the agent's precision, and not in that of the environment's actions.
-        actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, device=leaf.device)
+        shape = (*batch, self.decoder.residual_length, width)
+        actions[keys.DELTA] = Bounded(-delta, delta, shape, device=leaf.device)
         # The whole branch is removed, because an empty one would count as an action.
         del actions[keys.CHUNK[0]]
         return input_spec
@@ -263,19 +277,20 @@ class ResidualSampler(Drawing, TensorDictModuleBase):
         if distribution != "uniform" and sigma == 0:
             raise ValueError(f"a prior without noise needs 'uniform', got the distribution {distribution!r}")
         self.distribution, self.generator = distribution, generator
-        self.sigma, self.delta = sigma, decoder.delta
+        self.sigma, self.delta, self.residual_length = sigma, decoder.delta, decoder.residual_length
         self.in_keys, self.out_keys = [keys.ANCHOR], [keys.DELTA]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the residual."""
         check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
         anchor = tensordict.get(self.in_keys[0])
+        shape = (*anchor.shape[:-2], self.residual_length, anchor.shape[-1])
         # In the agent's precision, because a replay buffer holds residuals of both.
         like = {"device": anchor.device, "generator": self.chosen_generator()}
         if self.distribution == "uniform":
-            delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
+            delta = (2.0 * torch.rand(shape, **like) - 1.0) * self.delta
         else:
-            delta = self.sigma * torch.randn(anchor.shape, **like)
+            delta = self.sigma * torch.randn(shape, **like)
         if self.distribution == "clipped":
             delta = delta.clamp(-self.delta, self.delta)
         return tensordict.set(self.out_keys[0], delta)

@@ -17,7 +17,7 @@ from warmprior import keys
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.rl.anchor import has_anchor, source_anchor
+from warmprior.rl.anchor import has_anchor, held, source_anchor
 from warmprior.rl.networks import make_prior_space_actor
 
 _READ = (keys.ANCHOR, keys.ACTIONS)
@@ -90,7 +90,7 @@ class AgentStart(StartPoint):
         values = {self.observation_key: observation, keys.ANCHOR: anchor, keys.ACTIONS: history["actions"]}
         with set_exploration_type(ExplorationType.DETERMINISTIC if self.greedy else ExplorationType.RANDOM):
             delta = self.module(TensorDict(values, noise.shape[:-2]))[keys.DELTA]
-        return anchor + delta.to(anchor.dtype)
+        return anchor + held(delta, anchor.shape[-2]).to(anchor.dtype)
 
 
 def _as_key(key: Any) -> Any:

@@ -61,26 +61,48 @@ class BoxTanhNormal(TanhNormal):
 LOG_STD_RANGE = (-20.0, 2.0)
 
 
+class _Sizes:
+    """The shapes that an agent's networks read and write: observation, chunk and residual."""
+
+    def __init__(
+        self,
+        action_dim: int,
+        observation_dim: int,
+        prediction_length: int,
+        observation_steps: int,
+        residual_length: int | None,
+    ) -> None:
+        length = prediction_length if residual_length is None else residual_length
+        check_whole_numbers(
+            action_dim=action_dim,
+            observation_dim=observation_dim,
+            prediction_length=prediction_length,
+            observation_steps=observation_steps,
+            residual_length=length,
+        )
+        self.observation = (observation_steps, observation_dim)
+        self.chunk, self.residual = (prediction_length, action_dim), (length, action_dim)
+
+
 class _Trunk(nn.Module):
     """A network of ``num_layers`` times Linear, LayerNorm and Tanh, then Linear, on concatenated inputs."""
 
     def __init__(
         self,
         in_keys: Sequence[NestedKey],
-        chunk: tuple[int, int],
-        observation: tuple[int, int],
+        sizes: _Sizes,
         out_features: int,
         hidden_dim: int,
         num_layers: int,
         scales: Mapping[NestedKey, float],
     ) -> None:
         super().__init__()
-        names = ("prediction_length", "action_dim", "observation_steps", "observation_dim")
-        check_whole_numbers(**dict(zip(names, (*chunk, *observation), strict=True)))
         check_whole_numbers(hidden_dim=hidden_dim, num_layers=num_layers, out_features=out_features)
         check_distinct("in_keys", [str(key) for key in in_keys])
-        self.scales = [scales.get(unravel_key(key), 1.0) for key in in_keys]
-        self.in_features = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
+        names = [unravel_key(key) for key in in_keys]
+        self.scales = [scales.get(name, 1.0) for name in names]
+        chunks = sum(math.prod(sizes.residual if name == keys.DELTA else sizes.chunk) for name in names[1:])
+        self.in_features = math.prod(sizes.observation) + chunks
         norm: dict[str, Any] = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": hidden_dim}}
         # Its activation is Tanh.
         self.net = MLP(self.in_features, out_features, depth=num_layers, num_cells=hidden_dim, **norm)
@@ -98,7 +120,7 @@ class _Trunk(nn.Module):
 
 
 class _ActorHead(nn.Module):
-    """A head with the residual's location and scale before squashing, each ``[*B, P, d_a]``."""
+    """A head with the residual's location and scale before squashing, each ``[*B, R, d_a]``."""
 
     def __init__(self, trunk: _Trunk, shape: tuple[int, int]) -> None:
         super().__init__()
@@ -118,11 +140,12 @@ def make_prior_space_actor(
     observation_steps: int = 2,
     *,
     delta: float,
+    residual_length: int | None = None,
     hidden_dim: int = 256,
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
 ) -> ProbabilisticActor:
-    r"""Return a squashed Gaussian over :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
+    r"""Return a squashed Gaussian over :math:`\Delta \in [-\delta, \delta]^{R \times d_a}`, for SAC.
 
     It has DSRL's network: per layer ``Linear -> LayerNorm -> Tanh``, then location and log standard deviation
     (clipped to [-20, 2]). The official sizes are 3 layers of 2048 on Square and 128 on Transport. Its
@@ -134,6 +157,7 @@ def make_prior_space_actor(
         prediction_length: ``P``.
         observation_steps: ``To``.
         delta: half the side of the box, equal to :attr:`PriorDecoder.delta`.
+        residual_length: the number ``R`` of residuals per chunk, see :class:`PriorDecoder`; ``P`` by default.
         hidden_dim: width of the layers.
         num_layers: number of layers.
         in_keys: keys of the observation, ``[*B, To, d_o]``, and of any tensors ``[*B, P, d_a]``. Leave the
@@ -154,16 +178,15 @@ def make_prior_space_actor(
         torch.Size([5, 4, 2])
     """
     check_positive(delta=delta)
-    chunk = (prediction_length, action_dim)
-    trunk = _Trunk(
-        in_keys, chunk, (observation_steps, observation_dim), 2 * math.prod(chunk), hidden_dim, num_layers, {}
-    )
+    sizes = _Sizes(action_dim, observation_dim, prediction_length, observation_steps, residual_length)
+    residual = sizes.residual
+    trunk = _Trunk(in_keys, sizes, 2 * math.prod(residual), hidden_dim, num_layers, {})
     parameters = ["delta_loc", "delta_scale"]
     actor = ProbabilisticActor(
-        TensorDictModule(_ActorHead(trunk, chunk), in_keys=list(in_keys), out_keys=parameters),
+        TensorDictModule(_ActorHead(trunk, residual), in_keys=list(in_keys), out_keys=parameters),
         in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
         out_keys=[keys.DELTA],
-        spec=Composite({keys.DELTA: Bounded(-delta, delta, chunk)}),
+        spec=Composite({keys.DELTA: Bounded(-delta, delta, residual)}),
         distribution_class=BoxTanhNormal,
         # Two event dimensions give one log-probability per chunk, and not per action.
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
@@ -176,6 +199,7 @@ def make_prior_space_actor(
         "prediction_length": prediction_length,
         "observation_steps": observation_steps,
         "delta": delta,
+        "residual_length": residual[0],
         "hidden_dim": hidden_dim,
         "num_layers": num_layers,
         "in_keys": list(in_keys),
@@ -190,6 +214,7 @@ def make_prior_space_critic(
     observation_steps: int = 2,
     *,
     delta: float = 1.0,
+    residual_length: int | None = None,
     hidden_dim: int = 256,
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR, keys.DELTA),
@@ -209,6 +234,7 @@ def make_prior_space_critic(
         prediction_length: ``P``.
         observation_steps: ``To``.
         delta: half the side of the box, by which residuals are divided.
+        residual_length: the number ``R`` of residuals per chunk; ``P`` by default.
         hidden_dim: width of the layers.
         num_layers: number of layers.
         in_keys: keys of the observation, ``[*B, To, d_o]``, and of any tensors ``[*B, P, d_a]``.
@@ -227,14 +253,7 @@ def make_prior_space_critic(
         torch.Size([5, 1])
     """
     check_positive(delta=delta)
-    trunk = _Trunk(
-        in_keys,
-        (prediction_length, action_dim),
-        (observation_steps, observation_dim),
-        out_features,
-        hidden_dim,
-        num_layers,
-        {keys.DELTA: 1.0 / delta},
-    )
+    sizes = _Sizes(action_dim, observation_dim, prediction_length, observation_steps, residual_length)
+    trunk = _Trunk(in_keys, sizes, out_features, hidden_dim, num_layers, {keys.DELTA: 1.0 / delta})
     # TorchRL would call it "state_value", because the action is not named "action".
     return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])
