@@ -186,6 +186,18 @@ def test_one_seed_gives_one_result_and_another_another(tmp_path):
     assert not torch.isclose(runs[0][1][delta][:10], runs[2][1][delta][:10]).all()
 
 
+@pytest.mark.slow  # tracing the losses takes a minute
+def test_compiled_updates_learn_the_same(tmp_path, monkeypatch):
+    compile_, states = torch.compile, []
+    monkeypatch.setattr(torch, "compile", lambda function: compile_(function, backend="eager"))
+    for compiled in (False, True):
+        running = {"compile": compiled}
+        training = make_training(tmp_path / str(compiled), running=running, environment_steps=40)
+        training.run()
+        states.append(training.agent.state())
+    assert same(*states)
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_resume(tmp_path, algorithm):
     whole = make_training(tmp_path / "whole", training_class=Recorded, algorithm=algorithm)

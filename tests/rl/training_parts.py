@@ -124,9 +124,9 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0):
 
 
 def make_training(
-    directory, actor=None, env=None, training_class=PriorSpaceTraining, collection=None, **options
+    directory, actor=None, env=None, training_class=PriorSpaceTraining, running=None, **options
 ):
     actor = make_actor() if actor is None else actor
     environments = partial(make_env, **{"actor": actor} | (env or {}))
-    seeds = {"evaluation_seed": EVALUATION_SEED} | (collection or {})
-    return training_class(actor, environments, make_config(**options), directory, **seeds)
+    running = {"evaluation_seed": EVALUATION_SEED} | (running or {})
+    return training_class(actor, environments, make_config(**options), directory, **running)

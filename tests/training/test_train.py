@@ -109,7 +109,7 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
     spec.loader.exec_module(tqdm)
     monkeypatch.setattr("warmprior.io.progress.tqdm", tqdm.tqdm)
     train_policy(navigation_task(), PastPrior(4), network=NETWORK, training=CONFIG, description="train")
-    make_training(tmp_path, environment_steps=90, collection={"description": "agent"}).run()
+    make_training(tmp_path, environment_steps=90, running={"description": "agent"}).run()
     evaluate(make_actor(), make_env(0), episodes=2, first_seed=0, description="play")
     write_robomimic_file(tmp_path / "images.hdf5", lengths=(30,))
     RobomimicDemonstrations(tmp_path / "images.hdf5").steps(images=("agentview_image",))

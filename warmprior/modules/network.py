@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import chain
 from typing import Any
 
@@ -184,6 +185,23 @@ _PREFIX = "_orig_mod."
 def uncompiled(module: Any) -> Any:
     """Return the module inside a compiled one; any other is returned unchanged."""
     return getattr(module, _PREFIX[:-1], module)
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Raise ValueError, in one sentence, if what is compiled at its first call cannot be."""
+    try:
+        yield
+    except RuntimeError as error:
+        from torch._dynamo.exc import TorchDynamoException
+
+        if not isinstance(error, TorchDynamoException):
+            raise
+        reason = str(getattr(error, "inner_exception", error)).partition("\n")[0]
+        raise ValueError(
+            f"the network cannot be compiled ({reason}): install a C++ compiler, such as g++, or train "
+            "without compile"
+        ) from error
 
 
 def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 from warmprior import keys
 from warmprior.checks import check_finite
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import compiling
 from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualSampler
@@ -75,7 +76,7 @@ class PriorSpaceAgent:
         self.loss = self._make_loss(self.network, sizes).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self._updater = SoftUpdate(self.loss, tau=config.tau)
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate, fused=True)
 
     def _make_loss(self, network: ProbabilisticActor, sizes: dict[str, int]) -> LossModule:
         config = self.config
@@ -97,18 +98,29 @@ class PriorSpaceAgent:
             )
         return SACLoss(network, noise_critic, loss_function="l2", action_spec=network.spec, **entropy)
 
+    def compile(self) -> None:
+        """Compile the losses, decoding included."""
+        loss: Any = self.loss
+        if isinstance(loss, DSRLNALoss):
+            for name in ("reinforcement_loss", "distillation_loss"):
+                setattr(loss, name, torch.compile(getattr(loss, name)))
+        else:
+            loss.compile()
+
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Make the updates for one vector step of the environment, each on its own batch.
 
         Returns the critic's loss ``"q"`` and the temperature ``"alpha"`` of the last update. Raises
-        FloatingPointError if a loss is NaN or infinite, before it changes anything.
+        FloatingPointError if a loss is NaN or infinite, before it changes anything, and ValueError if the
+        losses cannot be compiled.
         """
         values: dict[str, Tensor] = {}
         schedule: Iterable[Callable[[TensorDictBase], TensorDict]] = [self.loss] * self.config.updates
         if isinstance(self.loss, DSRLNALoss):
             schedule = self.loss.schedule(self.config.updates)
         for compute in schedule:
-            result = compute(buffer.sample())
+            with compiling():
+                result = compute(buffer.sample())
             losses = {k: v for k, v in result.items() if k.startswith("loss_")}
             check_finite(losses)  # TorchRL's SAC does not check this
             self.optimizer.zero_grad()

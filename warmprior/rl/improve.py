@@ -74,6 +74,7 @@ def improve_policy(
     num_envs: int = 4,
     config: PriorSpaceConfig | None = None,
     episodes: int = 100,
+    compile: bool = False,
     description: str | None = "improve",
 ) -> Improvement:
     """Improve a policy by reinforcement learning in its source space.
@@ -96,6 +97,7 @@ def improve_policy(
         config: the recipe; by default :data:`~warmprior.rl.improve.SMALL`, at the policy's own number of
             network evaluations.
         episodes: episodes of the final comparison.
+        compile: True compiles the agent's updates with :func:`torch.compile`, which needs a C++ compiler.
         description: label of the progress bars; none if ``None``.
 
     Raises:
@@ -158,6 +160,7 @@ def improve_policy(
             directory,
             evaluation_seed=EVALUATION_SEED + APART,
             description=description,
+            compile=compile,
         )
         curve = training.run()
         frozen, improved = policy.replace(nfe=config.nfe), training.policy()

@@ -100,6 +100,7 @@ class PriorSpaceTraining:
         collect: a context manager that collects in other processes, called as ``collect(policy, make_env,
             num_envs=n, seed=seed)``; it yields rounds of decisions, a TensorDict ``[..., n, 1]`` each. By
             default this process collects.
+        compile: True compiles the updates with :func:`torch.compile`, which needs a C++ compiler.
 
     Attributes:
         agent (PriorSpaceAgent): the agent; its ``policy`` is the agent followed by the decoder.
@@ -143,6 +144,7 @@ class PriorSpaceTraining:
         evaluation_seed: int,
         description: str | None = None,
         collect: Callable[..., AbstractContextManager[Iterator[TensorDictBase]]] | None = None,
+        compile: bool = False,
     ) -> None:
         self.actor, self.make_env, self.config = actor, make_env, config
         self.directory, self.collect = Path(directory), collect
@@ -174,6 +176,8 @@ class PriorSpaceTraining:
         #: The path of the training state.
         self.state_path = self._state.path
         self._restore()
+        if compile:
+            self.agent.compile()
 
     def run(self) -> list[dict[str, Any]]:
         """Collect, learn and evaluate to the end.

@@ -15,6 +15,7 @@ from warmprior import keys
 from warmprior.io.distributed import world_size
 from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import compiling
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
 from warmprior.options.training import TrainingConfig
@@ -94,8 +95,8 @@ class GradientStep:
             torch.compiler.cudagraph_mark_step_begin()
         low = self.config.precision == "bf16"
         # Without the cache, which would return the weights that a coupling has cast without gradients.
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=low, cache_enabled=False):
-            loss = self._forward(batch)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=low, cache_enabled=False), compiling():
+            loss = cast(Tensor, self._loss(batch))
         self.optimizer.zero_grad()
         loss.backward()
         if self.config.max_grad_norm is not None:  # gradients are already averaged over all processes
@@ -104,20 +105,6 @@ class GradientStep:
         self.schedule.step()
         self._average()
         return loss.detach()
-
-    def _forward(self, batch: TensorDictBase) -> Tensor:
-        try:
-            return cast(Tensor, self._loss(batch))
-        except RuntimeError as error:  # a network is compiled when it is first called
-            from torch._dynamo.exc import TorchDynamoException
-
-            if not isinstance(error, TorchDynamoException):
-                raise
-            reason = str(getattr(error, "inner_exception", error)).partition("\n")[0]
-            raise ValueError(
-                f"the network cannot be compiled ({reason}): install a C++ compiler, such as g++, or train "
-                "without compile"
-            ) from error
 
     def averaged(self, actor: WarmPriorActor) -> WarmPriorActor:
         """Return the policy with the averaged weights."""

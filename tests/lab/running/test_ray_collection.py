@@ -34,7 +34,7 @@ def test_a_buffer_says_which_policy_acts():
 def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
     collect = partial(ray_rounds, collectors=2, address=ray_address)
-    training = make_training(tmp_path, actor, warmup_steps=40, collection={"collect": collect})
+    training = make_training(tmp_path, actor, warmup_steps=40, running={"collect": collect})
     fresh = copied(training.agent.state())
     training.run()
     lengths = LENGTHS * 2
