@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 
-collect_ignore = ["rows"]  # part of other runs, see there
+collect_ignore = ["rows", "fuzz/generators.py", "fuzz/__main__.py"]  # parts of other runs, see there
 
 
 def pytest_addoption(parser):
