@@ -128,11 +128,10 @@ def test_batch_shapes_and_whole_numbers_agree():
     assert torch.equal(loss_of(actor, whole), loss_of(actor, numbers))  # as chunks of one-hot actions
 
 
-@pytest.mark.parametrize("times", ["uniform", "u-shaped"])
-def test_the_loss_compiles_for_every_batch_size(times):
+def test_the_loss_compiles_for_every_batch_size():
     prior = PastPrior(H, correlation=0.5)
     actor = actor_for(prior).replace(generator=None)
-    loss = FlowMatchingLoss(actor, times=times)
+    loss = FlowMatchingLoss(actor, times="u-shaped")  # uniform ones are drawn first
     compiled = torch.compile(loss, backend="eager")
     for count in (3, 5, 7):
         data, found = sample(prior, count), []
