@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.data.hdf5_faults import FAULTS, replace
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.data import DatasetError
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 
@@ -70,8 +70,7 @@ def test_what_does_not_fit_is_refused_by_name(square_file, tmp_path, name):
     change, facts = OTHERS[name]
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
-    with raises(DatasetError, "square.hdf5", *facts):
-        RobomimicDemonstrations(path).index()
+    refuses(lambda: RobomimicDemonstrations(path).index(), DatasetError, "square.hdf5", *facts)
 
 
 @pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
@@ -88,8 +87,7 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
     content = path.read_bytes()
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
-    with raises(DatasetError, "square.hdf5", "data/demo_1/actions"):
-        RobomimicDemonstrations(path).steps()
+    refuses(lambda: RobomimicDemonstrations(path).steps(), DatasetError, "square.hdf5", "data/demo_1/actions")
 
 
 def test_values_whose_storage_ends_before_they_do(square_file):
@@ -130,8 +128,7 @@ def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monk
     path, _ = square_file
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
     monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed - 1)
-    with raises(DatasetError, "square.hdf5", 47, "memmap"):
-        RobomimicDemonstrations(path).steps()
+    refuses(lambda: RobomimicDemonstrations(path).steps(), DatasetError, "square.hdf5", 47, "memmap")
     monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed)
     RobomimicDemonstrations(path).steps()
 
@@ -181,7 +178,6 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
     monkeypatch.setattr(
         "warmprior.data.formats.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled")
     )
-    with raises(OSError, "GB", "scratch_dir"):
-        RobomimicDemonstrations(path).steps(**options)
+    refuses(lambda: RobomimicDemonstrations(path).steps(**options), OSError, "GB", "scratch_dir")
     gc.collect()
     assert len(list(tmp_path.rglob("action.memmap"))) == named  # those of the data alone

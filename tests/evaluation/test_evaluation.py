@@ -17,7 +17,7 @@ from torchrl._utils import _check_for_faulty_process
 from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
 from warmprior import (
@@ -338,13 +338,11 @@ def test_offsets_of_one_s_own_are_refused(form):
     env = SerialEnv(2, make_env, **options)
     if form != "nested":
         env = TransformedEnv(env, policy_transforms(PastPrior(H)))
-    with raises(ValueError, "seed_offset"):
-        evaluate(actor_for(), env, episodes=3, first_seed=7)
+    refuses(lambda: evaluate(actor_for(), env, episodes=3, first_seed=7), ValueError, "seed_offset")
 
 
 def test_environments_that_cannot_be_judged():
-    with raises(KeyError, "success"):
-        evaluate(actor_for(), single(CountingEnv), episodes=1, first_seed=0)
+    refuses(lambda: evaluate(actor_for(), single(CountingEnv), episodes=1, first_seed=0), KeyError, "success")
     with raises(KeyError, "policy_transforms"):
         evaluate(actor_for(), PlainEnv(), episodes=1, first_seed=0)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import mlp_actor
 from warmprior import PastPrior
 from warmprior.deploy import AsyncExecutor
@@ -152,8 +152,7 @@ def test_ctrl_c_stops_the_robot(example, clock, capsys):
 def test_what_the_policy_cannot_see_is_said_before_the_robot_moves(example, clock):
     arm = Arm(clock)
     arm.observe = lambda: {"joints": np.zeros(3)}
-    with raises(KeyError, "state", "joints"):
-        example.run(arm, policy(), 50.0, 0.99)
+    refuses(lambda: example.run(arm, policy(), 50.0, 0.99), KeyError, "state", "joints")
     assert arm.asked == ["connect", "stop"]
 
 

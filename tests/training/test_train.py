@@ -8,7 +8,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from lab.demonstrations.tasks import navigation_task
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
@@ -117,10 +117,8 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
 
 
 def test_what_does_not_exist_is_refused_with_what_does():
-    with raises(ValueError, "style", "'ph'"):
-        navigation_task("ph")
-    with raises(ValueError, "network", "mlp, plain_mlp", "'nonsense'"):
-        NetworkOptions(network="nonsense")
+    refuses(lambda: navigation_task("ph"), ValueError, "style", "'ph'")
+    refuses(lambda: NetworkOptions(network="nonsense"), ValueError, "network", "mlp, plain_mlp", "'nonsense'")
     with raises(ValueError, "encoder", "resnet18, small", "'resnet18-imagnet'"):
         NetworkOptions(encoder="resnet18-imagnet")  # its weights would be random
 
@@ -144,8 +142,7 @@ def test_options_of_transformers_reach_them_alone(name, value):
     for network in ("mlp", "plain_mlp"):
         with raises(ValueError, name, "chi_transformer and adaln_transformer", network):
             NetworkOptions(network, **{name: value})
-    with raises(ValueError, name, -1):
-        NetworkOptions("chi_transformer", **{name: -1})
+    refuses(lambda: NetworkOptions("chi_transformer", **{name: -1}), ValueError, name, -1)
 
 
 def test_options_of_images_are_refused_without_images():

@@ -16,7 +16,7 @@ import h5py
 from lab.demonstrations import render as render_module
 from lab.demonstrations.render import render_demonstrations
 from tests.data.synthetic import shortened
-from tests.errors import missing, raises
+from tests.errors import missing, raises, refuses
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
@@ -148,8 +148,7 @@ def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
 
 
 def test_images_beyond_any_memory_are_refused(copy):
-    with raises(ValueError, "1000000000"):
-        render_demonstrations(copy, CAMERAS, 10**9)
+    refuses(lambda: render_demonstrations(copy, CAMERAS, 10**9), ValueError, "1000000000")
     assert not list(copy.parent.glob("*.hdf5.*"))
 
 
@@ -169,8 +168,7 @@ def not_a_number(file):
 def test_states_that_cannot_be_rendered_are_refused(copy, change, facts):
     with h5py.File(copy, "a") as file:
         change(file)
-    with raises(DatasetError, "states", *facts):
-        render(copy, CAMERAS[:1], out=copy)
+    refuses(lambda: render(copy, CAMERAS[:1], out=copy), DatasetError, "states", *facts)
     assert not list(copy.parent.glob("*.hdf5.*/*"))
 
 
@@ -204,8 +202,7 @@ def test_images_upside_down_are_refused(picture):
     demonstrations = RobomimicDemonstrations(picture)
     compare = partial(apart(check_images), demonstrations, demonstrations.index(images=IMAGES))
     compare(fast=True)
-    with raises(DatasetError, "fast_rendering=True"):
-        compare(fast=False)
+    refuses(lambda: compare(fast=False), DatasetError, "fast_rendering=True")
     changes = {
         "upside down": lambda images: images[:, ::-1],
         "red and blue": lambda images: images[..., ::-1],
@@ -215,8 +212,7 @@ def test_images_upside_down_are_refused(picture):
         before = file[key][()]
     for fact, change in changes.items():
         replaced(picture, lambda images, change=change: change(before), key)
-        with raises(DatasetError, "agentview", fact):
-            compare(fast=True)
+        refuses(lambda: compare(fast=True), DatasetError, "agentview", fact)
 
 
 @pytest.mark.parametrize("lacking", ["EGL", "MyKitchen", "states"])

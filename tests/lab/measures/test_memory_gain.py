@@ -8,7 +8,7 @@ import torch
 from lab.measures.memory_gain import memory_gain
 from lab.methods.learned_sources import ForecastPrior, ForecastStart
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import (
     GaussianPrior,
     HistoryObservation,
@@ -146,8 +146,7 @@ def test_a_guided_policy_is_measured_as_it_acts():
     prior = PastPrior(H, sigma=0.5)
     guided = WarmPriorActor(Field(lambda t, a, o: a.sin()), prior, nfe=4, guidance=RealTimeChunking())
     data = windows(prior, 20)
-    with raises(KeyError, "replace(guidance=None)"):
-        memory_gain(guided, data)
+    refuses(lambda: memory_gain(guided, data), KeyError, "replace(guidance=None)")
     data["rtc", "delay"] = torch.ones(20, 1, dtype=torch.int64)
     found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
 
