@@ -16,7 +16,7 @@ from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
 from tests.benchmarks.drift import DriftEnv, arguments
 from tests.benchmarks.script_parts import refused, stored, written
-from tests.errors import raises
+from tests.errors import refuses
 from tests.processes import apart
 from tests.together import together
 from warmprior import RealTimeChunking, policy_transforms
@@ -148,8 +148,7 @@ def test_a_worker_that_reads_other_demonstrations_says_so(work, tmp_path):
     if work is not common.train:
         common.train(policy)
     common.cached_task.cache_clear()  # as in a fresh process
-    with raises(ValueError, "drift own", "seed"):
-        work(policy)
+    refuses(lambda: work(policy), ValueError, "drift own", "seed")
     assert work is not common.train or not policy.is_trained
 
 
@@ -190,7 +189,8 @@ def test_a_training_that_fails_costs_its_own_rows_alone(tmp_path, capsys, monkey
             raise FloatingPointError("the loss became nan")
         return train(task, prior, *args, **options)
 
-    few = {"prior": ["gaussian", "past"], "seeds": 1, "episodes": 1, "nfe": 1, "checkpoints": 1, "iterations": 4}
+    priors = ["gaussian", "past"]
+    few = {"prior": priors, "seeds": 1, "episodes": 1, "nfe": 1, "checkpoints": 1, "iterations": 4}
     argv = arguments(tmp_path / "out", **few)
     with monkeypatch.context() as patch:
         patch.setattr(common, "train_policy", failing)
@@ -199,7 +199,7 @@ def test_a_training_that_fails_costs_its_own_rows_alone(tmp_path, capsys, monkey
     assert {row["prior"] for row in stored(tmp_path / "out")} == {"gaussian"}
     assert "the loss became nan" in (tmp_path / "out" / "report.md").read_text()
     assert robomimic.main([*argv, "--resume"]) == 0
-    assert [row["prior"] for row in stored(tmp_path / "out")] == few["prior"]
+    assert [row["prior"] for row in stored(tmp_path / "out")] == priors
     # So does a trained policy of which the file with its time is damaged.
     (status,) = tmp_path.glob("policies/*-past-*/status.json")
     status.write_text(status.read_text()[:-9])
@@ -226,8 +226,7 @@ def run(folder):
 
 def test_several_processes_train_together_and_one_plays(finished, tmp_path):
     """The rows have the facts and order of one process; each draws its own part of a batch."""
-    with raises(Exception, "failed"):
-        together(run, tmp_path)
+    refuses(lambda: together(run, tmp_path), Exception, "failed")
     facts = ("prior", "sigma", "seed", "checkpoint", "nfe")
     alone, both = ([[r[f] for f in facts] for r in stored(f)] for f in (finished, tmp_path / "out"))
     assert both == [fact for fact in alone if fact[2] == 0]
