@@ -88,6 +88,27 @@ def forks_copy_little():
     gc.freeze()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def quick_simulators():
+    """The model of a robot alone, which robosuite compiles anew for every simulator, is compiled once.
+
+    Nor is all memory searched when one is closed.
+    """
+    if "robosuite.models.base" not in sys.modules:
+        yield
+        return
+    from robosuite.models.base import MujocoXML
+
+    compiled, get_model = {}, MujocoXML.get_model
+
+    def once(model):
+        text = model.get_xml()
+        return compiled.get(text) or compiled.setdefault(text, get_model(model))
+
+    with patch.object(MujocoXML, "get_model", once), patch("robosuite.utils.binding_utils.gc"):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def renders_apart():
     """No test leaves behind a process of which forked workers could not render."""

@@ -14,7 +14,7 @@ from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.rl import has_anchor
 
 TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
-TINY |= {"centre": "mean", "delta": 0.5}
+TINY |= {"centre": "mean", "delta": 0.5, "rl__hidden_dim": 16}
 SHORT = {"rl__environment_steps": 500, "rl__warmup_steps": 200, "rl__evaluate_every": 300}
 BOTH = ("dsrl-na", "dsrl-sac")
 
@@ -187,6 +187,7 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     (tmp_path / "evil" / "tasks.json").write_text('[{"task": "evil:task"}]')
     refuses(lambda: read(f"--run {tmp_path / 'evil'} --out {out}"), ValueError, "evil:task")
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
+    few |= {"rl__hidden_dim": 16, "rl__updates": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
     assert "--run has 1 seeds of past,sigma=0.3: agents [1] share policies" in capsys.readouterr().out
