@@ -28,6 +28,8 @@ ALSO_OF_LEROBOT = [
     *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
     *("tests/data/test_image_sizes.py", "tests/tasks/test_task.py", "tests/tasks/test_recording.py"),
     *("tests/benchmarks/test_joint_targets.py", "tests/benchmarks/test_paper_facts.py"),
+    *("tests/benchmarks/test_speed.py", "tests/modules/test_real_time_chunking.py"),
+    *("tests/test_docs.py", "tests/test_main.py"),
 ]
 
 
