@@ -22,11 +22,11 @@ from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)
+OPTIONS = {"network": NETWORK, "training": CONFIG, "description": None}
 
 
-def train(folder, prior=None, training=CONFIG, **options):
-    options |= {"network": NETWORK, "training": training, "description": None}
-    return train_policy(navigation_task(), prior or PastPrior(4), folder, **options)
+def train(folder, prior=None, **options):
+    return train_policy(navigation_task(), prior or PastPrior(4), folder, **OPTIONS | options)
 
 
 def equal(one, two):
@@ -59,8 +59,7 @@ def test_gradients_that_rollouts_hold_make_no_difference():
     for of in (torch.Tensor.clone, lambda value: value.clone().requires_grad_() * 1):
         steps = {name: of(value) for name, value in values.items()}
         steps = TensorDict(steps | {"episode": torch.arange(60) // 20}, [60])
-        options = {"network": NETWORK, "training": CONFIG, "description": None}
-        policies.append(train_policy(steps, PastPrior(4), **options))
+        policies.append(train_policy(steps, PastPrior(4), **OPTIONS))
     assert equal(*policies)
 
 
@@ -76,8 +75,7 @@ def test_scripts_in_double_precision_train_and_play(doubles, tmp_path, dtype):
     steps = demonstrations(d_o=2 + ACTION_DIM).apply(
         lambda value: value.to(dtype) if value.ndim > 1 else value
     )
-    options = {"network": NETWORK, "training": CONFIG, "description": None}
-    policy = train_policy(steps, PastPrior(4), tmp_path, **options)
+    policy = train_policy(steps, PastPrior(4), tmp_path, **OPTIONS)
     assert {value.dtype for value in policy.state_dict().values()} == {torch.float64}
     env = TransformedEnv(CountingEnv(5), policy_transforms(policy))
     assert env.rollout(3, policy)["vla_action", "chunk"].dtype == torch.float64
@@ -92,9 +90,8 @@ def test_a_replay_buffer_that_has_overwritten_steps_is_refused():
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(room))
         for part in steps.split(20):
             buffer.extend(part)
-        options = {"network": NETWORK, "training": CONFIG, "description": None}
         with raises(ValueError, "storage") if refused else nullcontext():
-            train_policy(buffer, PastPrior(4), **options)
+            train_policy(buffer, PastPrior(4), **OPTIONS)
 
 
 @pytest.mark.parametrize("turned_off", [False, True])
@@ -169,8 +166,7 @@ class Long(PastPrior):
 
 
 def test_networks_see_all_that_a_prior_remembers():
-    options = {"network": NETWORK, "training": CONFIG, "see_history": True, "nfe": 1, "description": None}
-    policy = train_policy(task := navigation_task(), Long(4), **options)
+    policy = train_policy(task := navigation_task(), Long(4), see_history=True, nfe=1, **OPTIONS)
     width = task.vector.shape[-1]
     assert policy.network.observation_dim == width + HistoryObservation.width(7, 1)
     with AsyncExecutor(policy, latency=0) as executor:

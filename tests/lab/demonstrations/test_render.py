@@ -6,7 +6,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("h5py")
 pytest.importorskip("robosuite")
@@ -18,7 +17,6 @@ from lab.demonstrations.render import render_demonstrations
 from tests.data.synthetic import shortened
 from tests.errors import missing, raises, refuses
 from tests.processes import apart, here
-from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
 from warmprior.data import DatasetError
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
@@ -239,18 +237,3 @@ def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, mo
         assert main([*argv, *IMAGES]) == 0
     assert not missing(capsys.readouterr().out, "EGL", "only trained")
     assert list(tmp_path.glob("out/*/policy_000001/model.safetensors"))
-
-
-@pytest.mark.parametrize("storage", ["memory", "memmap"])
-def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
-    place = {"storage": storage, "scratch_dir": tmp_path if storage == "memmap" else None}
-    data = RobomimicDemonstrations(rendered).steps(["robot0_eef_pos"], IMAGES, **place)
-    buffer = window_replay_buffer(data, PastPrior(2), batch_size=32, observation_steps=2)
-    stored = images_of(rendered)
-    for row in buffer.sample():
-        images = row["observation", IMAGES[0]]
-        assert images.shape == (2, 3, 16, 16) and images.dtype == torch.uint8
-        demo, step = divmod(int(row["frame"]), STEPS)
-        frames = stored[f"demo_{demo}/{IMAGES[0]}"]
-        for image, at in zip(images, (max(0, step - 1), step), strict=True):
-            np.testing.assert_array_equal(image.permute(1, 2, 0), frames[at])
