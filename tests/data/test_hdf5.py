@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.data.hdf5_faults import unreadable
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import raises, refuses
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
@@ -27,8 +28,7 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
     assert RobomimicDemonstrations(path, demos=11).index().demos == tuple(f"demo_{n}" for n in range(11))
     assert RobomimicDemonstrations(path, demos=2, mask="late").index().demos == ("demo_3", "demo_10")
-    with raises(DatasetError, "file.hdf5", 12, "demos=13"):
-        RobomimicDemonstrations(path, demos=13).index()
+    unreadable(path, 12, "demos=13", demos=13)
     refuses(lambda: RobomimicDemonstrations(path, demos=0).index(), ValueError, "demos", 0)
 
 
@@ -74,8 +74,7 @@ def test_files_without_rewards(tmp_path):
     with_rewards = RobomimicDemonstrations(path).steps()
     with h5py.File(path, "a") as file:
         del file["data/demo_1/rewards"]
-    with raises(DatasetError, "file.hdf5", "data/demo_1", "data/demo_0", "'rewards'"):
-        RobomimicDemonstrations(path).index()
+    unreadable(path, "data/demo_1", "data/demo_0", "'rewards'")
     with h5py.File(path, "a") as file:
         for number in (0, 2):
             del file[f"data/demo_{number}/rewards"]
@@ -108,13 +107,11 @@ def test_a_raw_recording_of_robosuite(tmp_path):
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
             del demo["obs"], demo["rewards"], demo["dones"]
-    with raises(DatasetError, "demo.hdf5", "data/demo_0", "'obs'", "states"):
-        RobomimicDemonstrations(path).index()
+    unreadable(path, "data/demo_0", "'obs'", "states")
     with h5py.File(path, "a") as file:
         del file["data"].attrs["env_args"], file["data"].attrs["total"]
         file["data"].attrs["env"] = "NutAssemblySquare"
-    with raises(DatasetError, "demo.hdf5", "'obs'", "states", "observe"):
-        RobomimicDemonstrations(path).index()
+    unreadable(path, "'obs'", "states", "observe")
 
 
 def test_a_file_that_another_process_writes(square_file):
@@ -123,8 +120,7 @@ def test_a_file_that_another_process_writes(square_file):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as other:
         assert other.stdout.readline() == "open\n"
-        with raises(DatasetError, "square.hdf5", "HDF5_USE_FILE_LOCKING"):
-            RobomimicDemonstrations(path).index()
+        unreadable(path, "HDF5_USE_FILE_LOCKING")
         other.stdin.close()
     RobomimicDemonstrations(path).index()
 
@@ -136,15 +132,14 @@ def test_a_flipped_bit_in_a_name(square_file):
     path.write_bytes(path.read_bytes().replace(b"demo_1\0", b"demo_0\0", 1))
     with h5py.File(path) as file:
         assert list(file["data"]).count("demo_0") == 2
-    refuses(lambda: RobomimicDemonstrations(path).index(), DatasetError, "square.hdf5", "'demo_0'")
+    unreadable(path, "'demo_0'")
 
 
 def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         del file["data/demo_1"]
-    with raises(DatasetError, "square.hdf5", "data.attrs['total'] counts 47", "demos have 42"):
-        RobomimicDemonstrations(path).index()
+    unreadable(path, "data.attrs['total'] counts 47", "demos have 42")
     assert (
         len(RobomimicDemonstrations(path, mask="train").index().demos)
         == len(RobomimicDemonstrations(path, demos=2).index().demos)
@@ -152,7 +147,7 @@ def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
     )
     with h5py.File(path, "a") as file:
         file["data"].attrs["total"] = "many"
-    refuses(lambda: RobomimicDemonstrations(path).index(), DatasetError, "square.hdf5", "data.attrs['total']")
+    unreadable(path, "data.attrs['total']")
     with h5py.File(path, "a") as file:
         del file["data"].attrs["total"]
     assert len(RobomimicDemonstrations(path).index().demos) == 2
@@ -167,7 +162,7 @@ def test_what_is_no_file_or_not_whole(square_file, tmp_path):
     parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
     for content in (*parts, b"<html>please log in"):
         path.write_bytes(content)
-        refuses(lambda: RobomimicDemonstrations(path).index(), DatasetError, "square.hdf5", "HDF5")
+        unreadable(path, "HDF5")
 
 
 def test_filter_keys(square_file, tmp_path):
