@@ -134,8 +134,8 @@ NOT_A_FLAG = {"terminations": lambda file, name, folder: replace(file, name, np.
     ("name", "fault"),
     [
         *product(("actions", "observations/arm"), sorted(FAULTS.keys() - {"all with many rows"})),
-        *product(("rewards", "terminations"), ("never written", "a row less")),
-        ("terminations", "terminations"),
+        *product(("rewards",), ("never written", "a row less", "a row more")),
+        *product(("terminations",), ("never written", "a row less", "terminations")),
         *product(("infos/success",), ("external link", "never written")),
     ],
 )
