@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 
-collect_ignore = ["rows"]  # part of other runs, see there
+collect_ignore = ["rows", "fuzz/generators.py", "fuzz/__main__.py"]  # parts of other runs, see there
 
 
 def pytest_addoption(parser):
@@ -28,6 +28,8 @@ ALSO_OF_LEROBOT = [
     *("tests/test_given_blocks.py", "tests/data/test_convert.py", "tests/data/test_recorded_actions.py"),
     *("tests/data/test_image_sizes.py", "tests/tasks/test_task.py", "tests/tasks/test_recording.py"),
     *("tests/benchmarks/test_joint_targets.py", "tests/benchmarks/test_paper_facts.py"),
+    *("tests/benchmarks/test_speed.py", "tests/modules/test_real_time_chunking.py"),
+    *("tests/test_docs.py", "tests/test_main.py"),
 ]
 
 
@@ -86,6 +88,27 @@ def forks_copy_little():
     """Let the garbage collectors of forks leave alone what was there: to look at it copies it."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def quick_simulators():
+    """The model of a robot alone, which robosuite compiles anew for every simulator, is compiled once.
+
+    Nor is all memory searched when one is closed.
+    """
+    if "robosuite.models.base" not in sys.modules:
+        yield
+        return
+    from robosuite.models.base import MujocoXML
+
+    compiled, get_model = {}, MujocoXML.get_model
+
+    def once(model):
+        text = model.get_xml()
+        return compiled.get(text) or compiled.setdefault(text, get_model(model))
+
+    with patch.object(MujocoXML, "get_model", once), patch("robosuite.utils.binding_utils.gc"):
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -27,3 +27,9 @@ def _words(fact):
     before = r"(?<![\w.-])" if fact[0].isdigit() else r"\b" if re.match(r"\w", fact) else ""
     after = r"(?!\w|\.\d)" if fact[-1].isdigit() else r"\b" if re.search(r"\w$", fact) else ""
     return before + re.escape(fact) + after
+
+
+def refuses(call, error, fact, *more):
+    """Check that a call raises this error, with these facts."""
+    with raises(error, fact, *more):
+        call()

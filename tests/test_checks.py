@@ -3,16 +3,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.checks import check_between, check_keys, check_shape, check_share
 
 
 @pytest.mark.parametrize("value", [True, "0.5", None, np.array([0.5, 0.5]), float("nan")])
 def test_shares_are_numbers(value):
-    with raises(ValueError, "ema_rate"):
-        check_share(ema_rate=value)
-    with raises(ValueError, "ema_rate"):
-        check_between(0, 1, ema_rate=value)
+    refuses(lambda: check_share(ema_rate=value), ValueError, "ema_rate")
+    refuses(lambda: check_between(0, 1, ema_rate=value), ValueError, "ema_rate")
 
 
 @pytest.mark.parametrize("shape", [(), (3, 3), (2, 3, 4)])

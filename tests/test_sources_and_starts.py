@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from lab.methods.methods import Method
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import Halfway, demonstrations
 from warmprior import (
     FlowMatchingLoss,
@@ -65,13 +65,11 @@ def test_agents_search_around_a_source_that_has_no_mean_of_the_history():
 
 
 def test_a_start_point_is_fixed_and_belongs_to_the_training(tmp_path, data):
-    with raises(ValueError, "Halfway"):
-        cloning(tmp_path / "free", data, start=Halfway())
+    refuses(lambda: cloning(tmp_path / "free", data, start=Halfway()), ValueError, "Halfway")
     training = cloning(tmp_path / "one", data, start=frozen())
     training.step()
     training._save()
-    with raises(ValueError, "start"):
-        cloning(tmp_path / "one", data, start=frozen(1.0))
+    refuses(lambda: cloning(tmp_path / "one", data, start=frozen(1.0)), ValueError, "start")
     assert cloning(tmp_path / "one", data, start=frozen()).iteration == 1
 
 
@@ -86,15 +84,13 @@ def test_a_resumed_reflow_has_the_teacher_that_it_began_with(tmp_path, data):
 
 def test_regression_and_a_start_on_the_way_do_not_go_together():
     actor = WarmPriorActor(network(), GaussianPrior(H), start=frozen(), max_nfe=1)
-    with raises(ValueError, "t = 0", "Halfway"):
-        FlowMatchingLoss(actor, times="start")
+    refuses(lambda: FlowMatchingLoss(actor, times="start"), ValueError, "t = 0", "Halfway")
 
 
 def test_nothing_is_withheld_behind_the_back_of_a_network_that_has_seen_it(data):
     buffer = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=1, see_history=True)
     buffer.append_transform(WithheldHistory(1.0))
-    with raises(ValueError, "WithheldHistory", "HistoryObservation"):
-        buffer.sample()
+    refuses(lambda: buffer.sample(), ValueError, "WithheldHistory", "HistoryObservation")
 
 
 def test_an_argument_called_name_is_refused():

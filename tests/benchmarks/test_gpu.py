@@ -50,7 +50,7 @@ def test_parts_write_rows_once_and_a_failure_stops_no_other(demonstrations, tmp_
 
 
 def test_methods_share_the_time(demonstrations, tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu, "iterations_per_second", lambda policy: 0.5)
+    monkeypatch.setattr(gpu, "iterations_per_second", lambda policy: 0.2)
     ticks = SimpleNamespace(monotonic=count(0, 2).__next__)  # two seconds pass from one look to the next
     monkeypatch.setattr(gpu, "time", ticks)
     options = gpu.GpuOptions(prior=("past", "gaussian"), device="cpu", smallest=True, minutes=1, out=tmp_path)
@@ -58,8 +58,8 @@ def test_methods_share_the_time(demonstrations, tmp_path, monkeypatch):
     assert [policy.method.name for policy in policies] == ["past", "gaussian"]
     (iterations,) = {policy.training.iterations for policy in policies}
     # Half of the minute each; what the first training took beyond its iterations is taken off.
-    beyond = 2 - gpu.TINY_PROBE / 0.5
-    assert iterations == int(0.5 * ((60 - 6) / 2 - beyond))
+    beyond = 2 - gpu.TINY_PROBE / 0.2
+    assert iterations == int(0.2 * ((60 - 6) / 2 - beyond))
     assert all(policy.is_trained for policy in policies)
 
 

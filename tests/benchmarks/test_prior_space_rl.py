@@ -9,12 +9,12 @@ import robomimic
 from lab.options.command_line import parse
 from lab.running.agents import environment, frozen_policies
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.rl import has_anchor
 
 TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
-TINY |= {"centre": "mean", "delta": 0.5}
+TINY |= {"centre": "mean", "delta": 0.5, "rl__hidden_dim": 16}
 SHORT = {"rl__environment_steps": 500, "rl__warmup_steps": 200, "rl__evaluate_every": 300}
 BOTH = ("dsrl-na", "dsrl-sac")
 
@@ -89,8 +89,7 @@ def test_resume_goes_on_where_it_stopped(toy, tmp_path, monkeypatch):
         patch.setattr(training, "evaluate", interrupted)
         benchmark.main(unit(tmp_path, seeds=1))
     assert len(calls) == 3 and not (tmp_path / "results.jsonl").exists()
-    with raises(ValueError, "--delta"):
-        read(f"--resume --out {tmp_path} --delta 0.7")
+    refuses(lambda: read(f"--resume --out {tmp_path} --delta 0.7"), ValueError, "--delta")
     assert benchmark.main(["--resume", "--out", str(tmp_path)]) == 0
     rows = stored(tmp_path)
     assert len(rows) == len(expected) == 3 and rows[:2] == expected[:2]
@@ -186,9 +185,9 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     (tmp_path / "evil").mkdir()
     (tmp_path / "evil" / "options.json").write_text(json.dumps(resumed))
     (tmp_path / "evil" / "tasks.json").write_text('[{"task": "evil:task"}]')
-    with raises(ValueError, "evil:task"):
-        read(f"--run {tmp_path / 'evil'} --out {out}")
+    refuses(lambda: read(f"--run {tmp_path / 'evil'} --out {out}"), ValueError, "evil:task")
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
+    few |= {"rl__hidden_dim": 16, "rl__updates": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
     assert "--run has 1 seeds of past,sigma=0.3: agents [1] share policies" in capsys.readouterr().out

@@ -25,7 +25,7 @@ from warmprior.saving.checkpoint import load_state
 
 def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypatch):
     out = tmp_path / "runs" / "first"
-    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 16)  # episodes of two decisions
+    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
     with monkeypatch.context() as patch:
         patch.setattr(pictures, "rendering_backend", rendering_backend)
         few = {"prior": ["gaussian", "past"], "episodes": 3}

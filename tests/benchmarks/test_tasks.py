@@ -28,19 +28,6 @@ from warmprior.saving.checkpoint import load_state
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
 
-def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validation, tmp_path):
-    for actions in ("absolute", "delta"):
-        argv = options(dataset, tmp_path / actions, prior="past", actions=actions)
-        assert robomimic.main(argv) == 0
-    (absolute,), (delta,) = (stored(tmp_path / name) for name in ("absolute", "delta"))
-    assert absolute["actions"] == "absolute" and "actions" not in delta
-    assert "Lift-PH, absolute actions" in (tmp_path / "absolute" / "report.md").read_text()
-    paths = [tmp_path / "policies" / row["policy"] / "policy_000030" for row in (absolute, delta)]
-    assert [load_policy(path).network.action_dim for path in paths] == [10, 7]
-    # What reads the run later knows it as well.
-    assert "Lift-PH, absolute actions" in flow(tmp_path / "absolute", validation)
-
-
 def test_observations_of_a_file_are_chosen(dataset):
     options = DataOptions(dataset=dataset, observations=("robot0_eef_pos", "object"))
     task, usual = load_task(options, None), load_task(DataOptions(dataset=dataset), None)
@@ -61,6 +48,7 @@ def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path
     assert "horizon 24 (None)" in report and "count padding True (False)" in report
     folder = tmp_path / "policies" / row["policy"]
     policy = load_policy(folder / "policy_000006")
+    assert policy.network.action_dim == 10 and "Lift-PH, absolute actions" in report
     assert policy.network.config().items() >= {"observation_layers": 2, "time_frequency": 1e-4}.items()
     assert environment_of(policy).horizon == 24
     recipe = load_state(folder / "state.safetensors")[1]["identity"]["config"]
@@ -90,10 +78,14 @@ def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monk
     few = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
     file = shortened(lift_demonstrations, tmp_path / "lift.hdf5", 12)
     argv = options(file, tmp_path / "run", prior=["gaussian", "history"], **few)
-    assert apart(robomimic.main)([*argv, "--fast-rendering"]) == 0
+
+    def both():  # as one process, which reads the task once
+        assert robomimic.main([*argv, "--fast-rendering"]) == 0
+        return flow(tmp_path / "run", file)
+
+    measured = apart(both)()
     assert [row["obs"] for row in stored(tmp_path / "run")] == ["image"] * 2
     assert described(tmp_path / "run", "tasks")[0]["images"]["fast_rendering"] is True
-    measured = apart(flow)(tmp_path / "run", file)
     assert "Lift-PH, image observations" in measured and "| History |" in measured
     # By hand: the encoder's features of raw images stand in place of them.
     (path,) = tmp_path.glob("cache/rendered/*.hdf5")

@@ -5,7 +5,18 @@ import os
 import h5py
 import numpy as np
 
+from tests.errors import raises
+from warmprior.data import DatasetError
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+
 NUMBERS = ("actions", "rewards", "obs/object", "obs/robot0_eef_pos", "obs/robot0_eef_quat")
+
+
+def unreadable(path, *facts, steps=None, **options):
+    """Check that a file is refused with its name and these facts: by its index, or by its steps."""
+    with raises(DatasetError, path.name, *facts):
+        file = RobomimicDemonstrations(path, **options)
+        file.index() if steps is None else file.steps(**steps)
 
 
 def replace(file, name, value=None, **options):

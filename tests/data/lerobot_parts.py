@@ -29,6 +29,14 @@ def scene(episode, step, side=32):
     return image
 
 
+def looks_at_one_column(features, name, feature):
+    """Set a column of a dataset; its package looks at all of them again, which are hundreds of statistics."""
+    from datasets.features.features import require_decoding
+
+    dict.__setitem__(features, name, feature)
+    features._column_requires_decoding[name] = require_decoding(feature)
+
+
 def write_lerobot(
     root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), same=(), **options
 ):
@@ -37,8 +45,10 @@ def write_lerobot(
     The last number of features that are resting never changes. Those that are the same have the values of the
     feature before them.
     """
+    from datasets import Features
     from lerobot.datasets import LeRobotDataset
 
+    Features.__setitem__ = looks_at_one_column  # for the rest of this process
     features = features or {name: numbers(width) for name, width in WIDTHS.items()}
     cameras = {f"observation.images.{name}": pictures(kind) for name, kind in images}
     dataset = LeRobotDataset.create(

@@ -11,7 +11,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.data import DatasetError, convert_robomimic
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -145,8 +145,7 @@ def test_what_rewards_do_not_say_is_not_written(tmp_path, rewards):
 def test_a_mask_that_names_no_episode(converted, tmp_path):
     path, _ = converted
     folder = convert_robomimic(path, tmp_path / "out", demos=1)  # the mask valid is of the second
-    with raises(DatasetError, "out", "mask", "valid"):
-        LeRobotDemonstrations(folder, mask="valid").steps()
+    refuses(lambda: LeRobotDemonstrations(folder, mask="valid").steps(), DatasetError, "out", "mask", "valid")
 
 
 def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
@@ -165,27 +164,22 @@ def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
 
 def test_what_cannot_be_converted(tmp_path):
     path, folder = tmp_path / "lift.hdf5", tmp_path / "out"
-    with raises(FileNotFoundError, path):
-        convert_robomimic(path, folder)
+    refuses(lambda: convert_robomimic(path, folder), FileNotFoundError, path)
     write_robomimic_file(path, task="lift", lengths=(3,))
     with raises(ValueError, "images", "image, video", "'gif'"):
         convert_robomimic(path, folder, images="gif")
-    with raises(ValueError, 32, 4):
-        convert_robomimic(path, folder, images="video")
+    refuses(lambda: convert_robomimic(path, folder, images="video"), ValueError, 32, 4)
     with h5py.File(path, "a") as file:
         del file["data/demo_0/obs/agentview_image"]
         file["data/demo_0/obs/robot0_eef_pos"][1] = np.nan
-    with raises(DatasetError, "no images"):
-        convert_robomimic(path, folder, images="image")
+    refuses(lambda: convert_robomimic(path, folder, images="image"), DatasetError, "no images")
     with raises(DatasetError, "demo_0/obs/robot0_eef_pos", "nan", "row 1"):
         convert_robomimic(path, folder)
     env_args = env_args_15("lift")
     env_args["env_kwargs"]["control_freq"] = 12.5
     write_robomimic_file(path, task="lift", lengths=(3,), env_args=env_args)
-    with raises(DatasetError, "control_freq", 12.5):
-        convert_robomimic(path, folder)
+    refuses(lambda: convert_robomimic(path, folder), DatasetError, "control_freq", 12.5)
     with h5py.File(path, "a") as file:
         del file["data"].attrs["env_args"]
-    with raises(DatasetError, "lift.hdf5", "env_args"):
-        convert_robomimic(path, folder)
+    refuses(lambda: convert_robomimic(path, folder), DatasetError, "lift.hdf5", "env_args")
     assert [p.name for p in tmp_path.iterdir()] == ["lift.hdf5"]

@@ -10,9 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.data.hdf5_faults import FAULTS, replace
-from tests.errors import raises
-from warmprior.data import DatasetError
+from tests.data.hdf5_faults import FAULTS, replace, unreadable
+from tests.errors import refuses
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 
 
@@ -60,8 +59,7 @@ def test_no_recording_is_read_that_holds(square_file, tmp_path, fault):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         FAULTS[fault](file, OBJECT, tmp_path)
-    with raises(DatasetError, "square.hdf5", *NAMED.get(fault, [OBJECT])):
-        RobomimicDemonstrations(path).steps()
+    unreadable(path, *NAMED.get(fault, [OBJECT]), steps={})
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -70,8 +68,7 @@ def test_what_does_not_fit_is_refused_by_name(square_file, tmp_path, name):
     change, facts = OTHERS[name]
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
-    with raises(DatasetError, "square.hdf5", *facts):
-        RobomimicDemonstrations(path).index()
+    unreadable(path, *facts)
 
 
 @pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
@@ -88,8 +85,7 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
     content = path.read_bytes()
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
-    with raises(DatasetError, "square.hdf5", "data/demo_1/actions"):
-        RobomimicDemonstrations(path).steps()
+    unreadable(path, "data/demo_1/actions", steps={})
 
 
 def test_values_whose_storage_ends_before_they_do(square_file):
@@ -100,8 +96,7 @@ def test_values_whose_storage_ends_before_they_do(square_file):
     content, before = path.read_bytes(), struct.pack("<2Q", place, 5 * 7 * 8)
     assert content.count(before) == 1
     path.write_bytes(content.replace(before, struct.pack("<2Q", place, 5 * 7 * 8 - 8)))
-    with raises(DatasetError, "square.hdf5", "data/demo_1/actions", "never written"):
-        RobomimicDemonstrations(path).steps()
+    unreadable(path, "data/demo_1/actions", "never written", steps={})
 
 
 MASKS = {
@@ -122,16 +117,14 @@ def test_masks_of_another_kind(square_file, name):
             file.create_group("mask/train")
         else:
             file["mask/train"] = mask
-    with raises(DatasetError, "square.hdf5", "mask/train", fact):
-        RobomimicDemonstrations(path, mask="train").index()
+    unreadable(path, "mask/train", fact, mask="train")
 
 
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):
     path, _ = square_file
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
     monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed - 1)
-    with raises(DatasetError, "square.hdf5", 47, "memmap"):
-        RobomimicDemonstrations(path).steps()
+    unreadable(path, 47, "memmap", steps={})
     monkeypatch.setattr("warmprior.data.steps.available_memory", lambda: needed)
     RobomimicDemonstrations(path).steps()
 
@@ -143,8 +136,7 @@ def test_values_that_no_robot_has(square_file, key, value):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         file[f"data/demo_2/{key}"][17, ...] = value
-    with raises(DatasetError, "square.hdf5", f"data/demo_2/{key}", "row 17"):
-        RobomimicDemonstrations(path).steps()
+    unreadable(path, f"data/demo_2/{key}", "row 17", steps={})
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0.9, 0, 0, 0)])
@@ -153,8 +145,7 @@ def test_absolute_actions_need_unit_quaternions(square_file, quaternion):
     with h5py.File(path, "a") as file:
         file["data/demo_1/obs/robot0_eef_quat"][3] = quaternion
     RobomimicDemonstrations(path).steps()
-    with raises(DatasetError, "square.hdf5", "data/demo_1/obs/robot0_eef_quat", "row 3"):
-        RobomimicDemonstrations(path).steps(actions="absolute")
+    unreadable(path, "data/demo_1/obs/robot0_eef_quat", "row 3", steps=dict(actions="absolute"))
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -181,7 +172,6 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
     monkeypatch.setattr(
         "warmprior.data.formats.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled")
     )
-    with raises(OSError, "GB", "scratch_dir"):
-        RobomimicDemonstrations(path).steps(**options)
+    refuses(lambda: RobomimicDemonstrations(path).steps(**options), OSError, "GB", "scratch_dir")
     gc.collect()
     assert len(list(tmp_path.rglob("action.memmap"))) == named  # those of the data alone

@@ -34,7 +34,7 @@ from warmprior.transforms import CameraImages
 
 JOINTS = [f"{name}.pos" for name in ("pan", "lift", "elbow", "flex", "roll", "gripper")]
 CAMERAS = {"front": (480, 640), "wrist": (480, 848)}
-LENGTHS = (3, 4, 5)
+LENGTHS = (3, 1, 4)
 SMALL = {"hidden_dim": 8, "encoder": "small"}
 
 
@@ -142,9 +142,9 @@ def test_every_format_gives_the_same_windows(places, episodes, options):
 def test_steps_in_memory_are_resized_alike(episodes):
     whole = {name: np.concatenate([episode[name] for episode in episodes]) for name in CAMERAS}
     frames = {name: torch.from_numpy(value).permute(0, 3, 1, 2) for name, value in whole.items()}
-    observation = TensorDict({"state": torch.rand(12, 6), **frames}, [12])
+    observation = TensorDict({"state": torch.rand(8, 6), **frames}, [8])
     episode = torch.arange(3).repeat_interleave(torch.tensor(LENGTHS))
-    steps = TensorDict({"observation": observation, "action": torch.rand(12, 6), "episode": episode}, [12])
+    steps = TensorDict({"observation": observation, "action": torch.rand(8, 6), "episode": episode}, [8])
     task = Task(demonstrations_of(steps, resize="pad"))
     for name, value in expected(episodes, resize="pad").items():
         assert torch.equal(task.data["observation", name], value)

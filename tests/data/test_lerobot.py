@@ -53,25 +53,6 @@ def test_windows_are_those_of_delta_timestamps(written):
         assert item["episode_index"] == data["episode"][i]
 
 
-def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
-    root, values = written
-    for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path}):
-        demonstrations = LeRobotDemonstrations(root, task=env_args_15("lift"))
-        data = demonstrations.steps(**options)
-        state = np.concatenate([values[f"observation.{n}state"] for n in ("environment_", "")], -1)
-        np.testing.assert_array_equal(data["observation"].numpy(), state)
-        np.testing.assert_array_equal(data["action"].numpy(), values["action"])
-        assert data["episode"].tolist() == [0] * 6 + [1] + [2] * 9
-        assert data["frame"].tolist() == list(range(16))
-        assert data["next", "done"].squeeze(-1).nonzero().squeeze(-1).tolist() == [5, 6, 15]
-        assert not data["next", "reward"].any() and not data["next", "terminated"].any()
-        assert torch.equal(data["next", "truncated"], data["next", "done"])
-        index = demonstrations.index()
-        assert len(index.demos) == 3 and index.task is TASKS["lift"] and index.path == root
-        assert index.observation_keys == TASKS["lift"].low_dim_keys
-        assert index.pose_columns.tolist() == [list(range(10, 17))]
-
-
 def test_images_are_decoded_as_lerobot_does(written):
     from lerobot.datasets import LeRobotDataset
 

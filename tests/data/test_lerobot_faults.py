@@ -9,7 +9,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.data import DatasetError
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
@@ -206,24 +206,17 @@ def test_observations_that_are_no_vectors_are_named(root, dtype, shape):
 
 
 def test_bad_options(root):
-    with raises(ValueError, "'disk'"):
-        LeRobotDemonstrations(root).steps(storage="disk")
-    with raises(FileNotFoundError, "meta/info.json"):
-        LeRobotDemonstrations(root / "absent").steps()
-    with raises(DatasetError, 3, "demos=4"):
-        LeRobotDemonstrations(root, demos=4).steps()
-    with raises(ValueError, "demos", 0):
-        LeRobotDemonstrations(root, demos=0).steps()
+    refuses(lambda: LeRobotDemonstrations(root).steps(storage="disk"), ValueError, "'disk'")
+    refuses(lambda: LeRobotDemonstrations(root / "absent").steps(), FileNotFoundError, "meta/info.json")
+    refuses(lambda: LeRobotDemonstrations(root, demos=4).steps(), DatasetError, 3, "demos=4")
+    refuses(lambda: LeRobotDemonstrations(root, demos=0).steps(), ValueError, "demos", 0)
     with raises(DatasetError, "'nothing'", "observation.state"):
         LeRobotDemonstrations(root).steps(observations=["nothing"])
     with raises(DatasetError, "'observation.images.side'", "images"):
         LeRobotDemonstrations(root).steps(observations=["observation.images.side"])
-    with raises(DatasetError, "observations"):
-        LeRobotDemonstrations(root).steps(observations=[])
-    with raises(DatasetError, "'train'", "none"):
-        LeRobotDemonstrations(root, mask="train").steps()
-    with raises(DatasetError, "'robot0_eef_pos'"):
-        LeRobotDemonstrations(root).index(poses=True)
+    refuses(lambda: LeRobotDemonstrations(root).steps(observations=[]), DatasetError, "observations")
+    refuses(lambda: LeRobotDemonstrations(root, mask="train").steps(), DatasetError, "'train'", "none")
+    refuses(lambda: LeRobotDemonstrations(root).index(poses=True), DatasetError, "'robot0_eef_pos'")
     # Poses that are none: random numbers where a quaternion should be.
     with raises(DatasetError, "robot0_eef_quat", "episode 0", "row"):
         LeRobotDemonstrations(root, task=LIFT).steps(actions="absolute")

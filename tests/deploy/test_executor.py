@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ACTION_DIM, CountingEnv, Momentum, mlp_actor, stirred
 from warmprior import (
     GaussianPrior,
@@ -193,8 +193,7 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
         assert executor.act(torch.tensor([float(tick)])).tolist() == [0.0, tick]
     assert time.monotonic() - started < 5  # it waited for nothing but the first chunk
     for _ in range(2):
-        with raises(TimeoutError, 3, "0.05"):
-            executor.act(torch.tensor([8.0]))
+        refuses(lambda: executor.act(torch.tensor([8.0])), TimeoutError, 3, "0.05")
     assert executor.delays == ()
     policy.leave.set()
     executor.timeout = 30.0
@@ -203,8 +202,7 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
     assert policy.threads[0] is policy.threads[1] is not threading.current_thread()
     executor.close()
     assert not policy.threads[0].is_alive()
-    with raises(RuntimeError, "closed"):
-        executor.act(torch.zeros(1))
+    refuses(lambda: executor.act(torch.zeros(1)), RuntimeError, "closed")
 
 
 class Failing(Scripted):
@@ -247,8 +245,7 @@ def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
         for tick in range(8):
             assert executor.act(torch.tensor([float(tick)]))[1] == tick
         for _ in range(3):
-            with raises(ZeroDivisionError, "camera"):
-                executor.act(torch.tensor([8.0]))
+            refuses(lambda: executor.act(torch.tensor([8.0])), ZeroDivisionError, "camera")
         policy.fails = ()
         while True:  # in a thread, the last call may still have failed
             with contextlib.suppress(ZeroDivisionError):
@@ -329,8 +326,7 @@ def test_chunks_that_no_robot_should_get():
     ],
 )
 def test_options_that_cannot_be(options, facts):
-    with raises(ValueError, *facts):
-        running(Scripted(8), **{"prior": GaussianPrior(8)} | options)
+    refuses(lambda: running(Scripted(8), **{"prior": GaussianPrior(8)} | options), ValueError, *facts)
     assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]
 
 

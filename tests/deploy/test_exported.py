@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import mlp_actor, stirred
 from warmprior import (
     CVAEPrior,
@@ -143,13 +143,10 @@ def test_what_cannot_be_exported_is_refused_in_one_sentence(uncompiled, tmp_path
     path = tmp_path / "policy.pt2"
     with raises(ValueError, "Real-Time Chunking"):
         export_policy(policy(PastPrior(4), guidance=RealTimeChunking()), path)
-    with raises(ValueError, "torch.randn"):
-        export_policy(policy(Uniform(4)), path)
-    with raises(ValueError, "Branching"):
-        export_policy(policy(Branching(4)), path)
+    refuses(lambda: export_policy(policy(Uniform(4)), path), ValueError, "torch.randn")
+    refuses(lambda: export_policy(policy(Branching(4)), path), ValueError, "Branching")
     save_policy(policy(PastPrior(4)), tmp_path)
-    with raises(ValueError, "config.json"):
-        export_policy(policy(PastPrior(4)), tmp_path / "config.pt2")
+    refuses(lambda: export_policy(policy(PastPrior(4)), tmp_path / "config.pt2"), ValueError, "config.json")
     assert not path.exists()
 
 
@@ -164,15 +161,12 @@ def test_a_file_for_another_machine_or_of_other_code_is_not_loaded(uncompiled, t
         ({"program": "0" * 64}, "policy.pt2", "policy.json"),
     ):
         path.with_suffix(".json").write_text(json.dumps(description | change))
-        with raises(ValueError, *facts):
-            load_exported(path)
+        refuses(lambda: load_exported(path), ValueError, *facts)
     for damaged, fact in (([], "policy.json"), ({"program": "0"}, "inputs")):
         path.with_suffix(".json").write_text(json.dumps(damaged))
-        with raises(ValueError, fact, "export"):
-            load_exported(path)
+        refuses(lambda: load_exported(path), ValueError, fact, "export")
     path.with_suffix(".json").unlink()
-    with raises(FileNotFoundError, "policy.json"):
-        load_exported(path)
+    refuses(lambda: load_exported(path), FileNotFoundError, "policy.json")
     assert not loaded
 
 
@@ -218,5 +212,4 @@ def test_torch_export_takes_a_policy_and_its_entries_as_keywords():
         program = torch.export.export(actor, args=(), kwargs=entries, strict=False)
         *_, expected = actor(**entries)
     torch.testing.assert_close(program.module()(**entries)[-1], expected)
-    with raises(TypeError, "observations", "observation"):
-        actor(**entries, observations=1)
+    refuses(lambda: actor(**entries, observations=1), TypeError, "observations", "observation")

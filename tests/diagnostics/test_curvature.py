@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import curvature
 
@@ -70,13 +70,10 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
 
 def test_bad_options_and_policies_are_named():
     field = policy(lambda t, a, o: -a)
-    with raises(ValueError, "n_steps", 2, 1):
-        curvature(field, batch(), 1)
-    with raises(ValueError, 1, 100):
-        curvature(policy(lambda t, a, o: -a, max_nfe=1), batch())
+    refuses(lambda: curvature(field, batch(), 1), ValueError, "n_steps", 2, 1)
+    refuses(lambda: curvature(policy(lambda t, a, o: -a, max_nfe=1), batch()), ValueError, 1, 100)
 
     def explodes(t, a, o):
         return torch.where((torch.arange(len(a)) == 2).view(-1, 1, 1), a * torch.inf, -a)
 
-    with raises(FloatingPointError, "1 of 5", "observation 2"):
-        curvature(policy(explodes), batch())
+    refuses(lambda: curvature(policy(explodes), batch()), FloatingPointError, "1 of 5", "observation 2")

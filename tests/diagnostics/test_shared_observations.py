@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.diagnostics.fields import policy
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations
 
@@ -73,12 +73,9 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
 
 def test_bad_input_is_named():
     data = steps([5, 4])
-    with raises(ValueError, "count=100", "3 of 9"):
-        SharedObservations(data, H, count=100)
-    with raises(ValueError, "chunk length"):
-        SharedObservations(data, H).windows(PastPrior(H + 1))
+    refuses(lambda: SharedObservations(data, H, count=100), ValueError, "count=100", "3 of 9")
+    refuses(lambda: SharedObservations(data, H).windows(PastPrior(H + 1)), ValueError, "chunk length")
     for offset in (-1, H + 1):
         with raises(ValueError, "offset", 0, H):
             SharedObservations(data, H).windows(PastPrior(H), offset=offset)
-    with raises(KeyError, "episode"):
-        SharedObservations(data.exclude("episode"), H)
+    refuses(lambda: SharedObservations(data.exclude("episode"), H), KeyError, "episode")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ACTION_DIM, CountingEnv, mlp_actor, stirred
 from warmprior import ChunkStep, GaussianPrior, HistoryObservation, PastPrior, keys
 from warmprior.diagnostics import executed_actions, smoothness
@@ -78,8 +78,7 @@ def test_rows_of_a_collector_may_be_joined(decisions):
     rollout = rollout_of(chunks, [[2] * decisions] * 3)
     rollout["collector", "traj_ids"] = torch.arange(3)[:, None].expand(3, decisions).clone()
     if decisions == 1:
-        with raises(ValueError, "chunk boundary"):
-            smoothness(rollout.reshape(-1))
+        refuses(lambda: smoothness(rollout.reshape(-1)), ValueError, "chunk boundary")
         return
     one, other = smoothness(rollout), smoothness(rollout.reshape(-1))
     assert vars(one) == pytest.approx(vars(other), nan_ok=True)
@@ -113,13 +112,11 @@ def test_equal_chunks_of_short_episodes_all_count():
 
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
-    with raises(KeyError, "ChunkStep"):
-        smoothness(TensorDict({"vla_action": {"chunk": chunks}}, [3]))
+    refuses(lambda: smoothness(TensorDict({"vla_action": {"chunk": chunks}}, [3])), KeyError, "ChunkStep")
     for rollout in (rollout_of(chunks[:1], [2]), rollout_of(chunks[:2], [2, 2], [True, True])):
         with raises(ValueError, "chunk boundary"):
             smoothness(rollout)
-    with raises(ValueError, "NaN"):
-        smoothness(rollout_of(chunks * math.nan, [2, 2, 2]))
+    refuses(lambda: smoothness(rollout_of(chunks * math.nan, [2, 2, 2])), ValueError, "NaN")
     with raises(ValueError, "decisions"):
         executed_actions(rollout_of(chunks[:0], torch.zeros(0, dtype=torch.int64)))
 
@@ -147,8 +144,7 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
         generator.manual_seed(seed)
     *_, dispatched = disturbed(*(data[key] for key in disturbed.in_keys))
     torch.testing.assert_close(dispatched, chunk)
-    with raises(ValueError, "std"):
-        HistoryShift(actor, -1.0)
+    refuses(lambda: HistoryShift(actor, -1.0), ValueError, "std")
     monkeypatch.setattr("warmprior.modules.generator.get_spawning_popen", lambda: object())
     with raises(RuntimeError, "same noise"):
         disturbed.policy = actor.replace(generator=None)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import source_leak
 
@@ -117,8 +117,7 @@ def test_episodes_may_be_part_of_the_data():
     assert source_leak(actor, alone, nfes=(1,))[1].data_spread > 0
     alone["vla_action", "chunk"][:] = 1.0
     assert source_leak(actor, alone, nfes=(1,))[1].data_spread == 0.0
-    with raises(ValueError, "episode"):
-        source_leak(actor, alone, episodes=episodes[:20])
+    refuses(lambda: source_leak(actor, alone, episodes=episodes[:20]), ValueError, "episode")
 
 
 def test_noise_on_demonstrations_that_never_move_is_named():
@@ -145,11 +144,7 @@ def test_padded_positions_do_not_count():
 
 def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
-    with raises(KeyError, "chunk"):
-        source_leak(actor, data.exclude(("vla_action", "chunk")))
-    with raises(ValueError, "episodes", "[4]", "[5]"):
-        source_leak(actor, data, episodes=torch.zeros(4))
-    with raises(ValueError, "draws", 2, 1):
-        source_leak(actor, data, draws=1)
-    with raises(FloatingPointError, "NFE 9"):
-        source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)
+    refuses(lambda: source_leak(actor, data.exclude(("vla_action", "chunk"))), KeyError, "chunk")
+    refuses(lambda: source_leak(actor, data, episodes=torch.zeros(4)), ValueError, "episodes", "[4]", "[5]")
+    refuses(lambda: source_leak(actor, data, draws=1), ValueError, "draws", 2, 1)
+    refuses(lambda: source_leak(policy(lambda t, a, o: a / (t < 0.5)), data), FloatingPointError, "NFE 9")

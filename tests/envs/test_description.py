@@ -7,7 +7,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
@@ -105,5 +105,4 @@ def test_a_description_with_more_or_less_builds_nothing(change):
         if value is None:
             del described[name]
     policy = WarmPriorActor(VelocityMLP(7, 19, 4, hidden_dim=16), PastPrior(4), environment=described)
-    with raises(ValueError, "environment"):
-        environment_of(policy)
+    refuses(lambda: environment_of(policy), ValueError, "environment")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tests.data.synthetic import env_args_14, env_args_15
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior.envs.env_args import absolute_actions, delta_conventions, modernize_env_args
 from warmprior.rotation import (
     matrix_to_rotation_6d,
@@ -87,8 +87,7 @@ def test_delta_conventions_read_the_controller():
     assert output_max.tolist() == limits
     torch.testing.assert_close(base, torch.eye(3, dtype=torch.float64)[None])
     meta["env_kwargs"]["controller_configs"]["output_min"] = [-0.2] * 6
-    with raises(ValueError, "symmetric"):
-        delta_conventions(meta)
+    refuses(lambda: delta_conventions(meta), ValueError, "symmetric")
 
 
 @pytest.mark.parametrize(("task", "frame"), [("lift", "world"), ("transport", "base")])

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from torchrl.envs import SerialEnv
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.envs.gymnasium import gym_env
 
 
@@ -88,21 +88,18 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
     env = gym_env(Signs(), observation_keys=["grey", "flags"])
     assert env.observation_spec["observation"].dtype == torch.float32
     assert SerialEnv(2, lambda: env).rollout(2)["observation"][1, 1].tolist() == [200.0, 1.0, 0.0]
-    with raises(ValueError, "'choice'", "FlattenObservation"):
-        gym_env(Signs())
+    refuses(lambda: gym_env(Signs()), ValueError, "'choice'", "FlattenObservation")
     with raises(ValueError, "observation_keys", "['grey', 'grey']"):
         gym_env(Signs(), observation_keys=["grey", "grey"])
     mode = gymnasium.vector.AutoresetMode.SAME_STEP
     both = gymnasium.vector.SyncVectorEnv([lambda: Dial(nested=True)] * 2, autoreset_mode=mode)
     assert gym_env(both).reset()["observation"].shape == (2, 3)  # without what info tells
-    with raises(ValueError, "solved", "ParallelEnv"):
-        gym_env(both, success="solved")
+    refuses(lambda: gym_env(both, success="solved"), ValueError, "solved", "ParallelEnv")
 
 
 @pytest.mark.parametrize("name", ["turns", "dial", "observation", "reward", "terminated"])
 def test_info_replaces_nothing_else_that_a_step_returns(name):
-    with raises(ValueError, f"['{name}'] of info"):
-        gym_env(Dial(nested=True), success=name)
+    refuses(lambda: gym_env(Dial(nested=True), success=name), ValueError, f"['{name}'] of info")
     with raises(ValueError, f"['{name}'] of info"):
         gym_env(Dial(nested=True), success="solved", measures=["height", name])
 
@@ -129,8 +126,7 @@ def test_a_fraction_is_no_success(value):
             return *super().step(action)[:4], {"solved": value}
 
     env = gym_env(Saying(), success="solved")
-    with raises(ValueError, "'solved'", "measures"):
-        env.rollout(5)
+    refuses(lambda: env.rollout(5), ValueError, "'solved'", "measures")
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])

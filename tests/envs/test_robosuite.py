@@ -21,7 +21,7 @@ from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
 
-make_lift = partial(RobosuiteEnv, "lift", horizon=15)
+make_lift = partial(RobosuiteEnv, "lift", horizon=15, fast_rendering=True)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from torchrl.data import Categorical, Unbounded
 from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, closing, placed
 from warmprior import ChunkStep, PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
@@ -221,5 +221,4 @@ def test_a_success_keeps_its_type(dtype):
 def test_states_of_an_environment_are_no_measures():
     """A chunk would leave its largest height where the next step reads the last one."""
     transforms = policy_transforms(PastPrior(H), observation_steps=1, measures={"height": "max"})
-    with raises(ValueError, "height", "another key"):
-        TransformedEnv(NavigationEnv(), transforms).reset()
+    refuses(lambda: TransformedEnv(NavigationEnv(), transforms).reset(), ValueError, "height", "another key")

@@ -29,13 +29,13 @@ def _raise(error):
         (lambda: _raise(KeyError("here/file")), "unclear"),
         (lambda: os.kill(os.getpid(), signal.SIGKILL), "crash"),
         (lambda: time.sleep(60), "hang"),
-        (lambda: bytearray(3 * 2**26) and Outcome("equal"), "memory"),
+        (lambda: bytearray(3 * 2**25) and Outcome("equal"), "memory"),
     ],
 )
 def test_outcomes(monkeypatch, load, kind):
-    ballast = bytearray(2**28)  # as in the process of a long suite
-    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 4.0)
-    monkeypatch.setattr(sandbox, "LIMIT_BYTES", 2**27)
+    ballast = bytearray(2**27)  # as in the process of a long suite
+    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 0.5 if kind == "hang" else 30.0)
+    monkeypatch.setattr(sandbox, "LIMIT_BYTES", 2**26)
     outcome = attempt(load, "here/file")
     assert outcome.kind == kind
     assert outcome.failed == (kind not in ("equal", "refused"))

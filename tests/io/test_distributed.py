@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lab.io.machine import check_device
-from tests.errors import raises
+from tests.errors import refuses
 from tests.together import together
 from warmprior.io.distributed import launched, leader_first, rank, world_size
 
@@ -30,10 +30,8 @@ def test_alone(monkeypatch):
 
 
 def test_several_processes_share_no_gpu(under_torchrun, two_gpus):
-    with raises(ValueError, 3, 2):
-        check_device("cuda")
-    with raises(ValueError, "--device cuda:1", "write --device cuda"):
-        check_device("cuda:1")
+    refuses(lambda: check_device("cuda"), ValueError, 3, 2)
+    refuses(lambda: check_device("cuda:1"), ValueError, "--device cuda:1", "write --device cuda")
     check_device("cpu")
 
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.io.files import check_writable, exclusive, read_json, read_tensors, save_file, write_atomic
 
 FORK = multiprocessing.get_context("fork")
@@ -83,7 +83,5 @@ def test_files_and_folders_that_cannot_be_used_are_named(tmp_path):
     path = tmp_path / "file"
     for content in (b"", b"{", b"[" * 100_000, b'"\xff"'):
         path.write_bytes(content)
-        with raises(ValueError, path, "JSON"):
-            read_json(path)
-    with raises(OSError, path):
-        check_writable(path)
+        refuses(lambda: read_json(path), ValueError, path, "JSON")
+    refuses(lambda: check_writable(path), OSError, path)

@@ -2,7 +2,7 @@ import os
 import signal
 import time
 
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior.io.script import run_script
 
 
@@ -24,5 +24,4 @@ def test_errors_of_ours_are_not_hidden():
     def script():
         raise TypeError("a defect")
 
-    with raises(TypeError, "a defect"):
-        run_script(script, "a.py")
+    refuses(lambda: run_script(script, "a.py"), TypeError, "a defect")

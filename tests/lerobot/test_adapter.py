@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, generator, observations, windows
 from tests.toy_env import Momentum, window_histories
@@ -64,8 +64,7 @@ def test_chunks_are_guided_towards_the_rest_of_the_last_one(built, monkeypatch, 
         adapter.predict_action_chunk(dict(batch), executed_steps=torch.tensor([LENGTH, 2]), delay=1)
     with raises(ValueError, "delay", 0.5):
         adapter.predict_action_chunk(dict(batch), executed_steps=1, delay=0.5)
-    with raises(ValueError, "n_action_steps", LENGTH):
-        adapter.select_action(dict(batch))
+    refuses(lambda: adapter.select_action(dict(batch)), ValueError, "n_action_steps", LENGTH)
     with raises(ValueError, "pi0, pi05", "smolvla"):
         WarmPriorAdapter(built("multi_task_dit"), PastPrior(4), guidance=rtc)
 
@@ -159,10 +158,8 @@ def test_the_standard_deviation_in_a_policys_units(policy):
     }
     for family, normalised in by_hand.items():
         torch.testing.assert_close(action_std(policy(family), stats), normalised.std(0))
-    with raises(ValueError, "std, q01, q99", "'action'"):
-        action_std(policy("pi05"), None)
-    with raises(ValueError, "IDENTITY"):
-        action_std(policy("xvla"), stats)
+    refuses(lambda: action_std(policy("pi05"), None), ValueError, "std, q01, q99", "'action'")
+    refuses(lambda: action_std(policy("xvla"), stats), ValueError, "IDENTITY")
     with raises(ValueError, "std", "got 0.0"):
         WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), std=values.std(0) * 0)
 
@@ -193,8 +190,7 @@ def test_relative_actions_follow_the_state(built):
     preprocess, postprocess = pipelines(made, stats)
     relative = RelativeActions(preprocess, postprocess)
     adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), relative=relative, generator=generator())
-    with raises(ValueError, "relative=RelativeActions"):
-        WarmPriorAdapter(made, PastPrior(LENGTH))
+    refuses(lambda: WarmPriorAdapter(made, PastPrior(LENGTH)), ValueError, "relative=RelativeActions")
     batch = observations("pi0", 2)
     states = torch.randn(2, 2, 7, generator=generator(5))
 
@@ -218,11 +214,9 @@ def test_batches_that_do_not_fit(policy):
     with raises(KeyError, "action_is_pad"):
         adapter.loss({key: value for key, value in batch.items() if key != "action_is_pad"})
     short = {name: batch[name][:, LENGTH:] for name in ("action", "action_is_pad")}
-    with raises(ValueError, "{'action': 8}", "{'action': 16}"):
-        adapter.loss({**batch, **short})
+    refuses(lambda: adapter.loss({**batch, **short}), ValueError, "{'action': 8}", "{'action': 16}")
     adapter.predict_action_chunk(observations("pi05", 2))
-    with raises(ValueError, "executed_steps="):
-        adapter.predict_action_chunk(observations("pi05", 2))
+    refuses(lambda: adapter.predict_action_chunk(observations("pi05", 2)), ValueError, "executed_steps=")
     with raises(ValueError, "noise="):
         noise = torch.zeros(2, LENGTH, 12)
         adapter.predict_action_chunk(observations("pi05", 2), executed_steps=1, noise=noise)

@@ -1,13 +1,15 @@
 import json
 import resource
+import shutil
 import sys
+from functools import cache
 from itertools import product
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.lerobot.plugin_policies import VLA, flow_policy, small, warm
 
 NAMES = [*VLA, "warm_flow"]
@@ -22,6 +24,25 @@ def load(found, name, folder, **options):
         return found[name].from_pretrained(folder, **options)
     with small(name):
         return found[name].from_pretrained(folder, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(found, tmp_path_factory):
+    """Folders of policies, each of which is saved once: tests change copies of them."""
+
+    @cache
+    def folder(name):
+        place = tmp_path_factory.mktemp(name)
+        made(found, name, n_action_steps=4).save_pretrained(place)
+        load(found, name, place)
+        return place
+
+    return folder
+
+
+@pytest.fixture
+def saved(whole, tmp_path):
+    return lambda name: shutil.copytree(whole(name), tmp_path, dirs_exist_ok=True)
 
 
 def edit(folder, change):
@@ -63,22 +84,19 @@ MISFITS = ["absent", "foreign", "missing", "shape", "unexpected"]
     ("name", "how"),
     [*product(NAMES, MISFITS), *(("warm_flow", how) for how in ("1e30", "NaN", "whole numbers"))],
 )
-def test_weights_that_do_not_fit_are_refused_by_name(found, name, how, tmp_path):
-    made(found, name).save_pretrained(tmp_path)
-    load(found, name, tmp_path)
+def test_weights_that_do_not_fit_are_refused_by_name(found, saved, name, how, tmp_path):
+    saved(name)
     fact = misfit(tmp_path, how)
-    with raises((ValueError, FileNotFoundError), fact, tmp_path):
-        load(found, name, tmp_path)
+    refuses(lambda: load(found, name, tmp_path), (ValueError, FileNotFoundError), fact, tmp_path)
 
 
-def test_damaged_weights_are_named(found, tmp_path):
-    made(found, "warm_flow").save_pretrained(tmp_path)
+def test_damaged_weights_are_named(found, saved, tmp_path):
+    saved("warm_flow")
     file = tmp_path / "model.safetensors"
     content = bytearray(file.read_bytes())
     content[0] ^= 0xFF  # the length of the header
     file.write_bytes(content)
-    with raises(ValueError, file, "damaged"):
-        load(found, "warm_flow", tmp_path)
+    refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, file, "damaged")
 
 
 @pytest.mark.parametrize(
@@ -88,28 +106,26 @@ def test_damaged_weights_are_named(found, tmp_path):
         ("output_features", {"action": {"type": "ACTION", "shape": [10**30]}}),
     ],
 )
-def test_a_configuration_of_which_nothing_can_be_built(found, tmp_path, option, value):
-    made(found, "warm_flow").save_pretrained(tmp_path)
+def test_a_configuration_of_which_nothing_can_be_built(found, saved, tmp_path, option, value):
+    saved("warm_flow")
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | {option: value}))
-    with raises(ValueError, tmp_path, "cannot be built"):
-        load(found, "warm_flow", tmp_path)
+    refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "cannot be built")
 
 
-def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, tmp_path):
-    made(found, "warm_flow").save_pretrained(tmp_path)
+def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, saved, tmp_path):
+    saved("warm_flow")
     config = json.loads((tmp_path / "config.json").read_text())
     for width in (24_000, 960_000):  # gigabytes, and terabytes
         (tmp_path / "config.json").write_text(json.dumps(config | {"embedding_dim": width, "network": ""}))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        with raises(ValueError, tmp_path, "far more weights"):
-            load(found, "warm_flow", tmp_path)
+        refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "far more weights")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
 
-def test_buffers_of_normalisation_of_old_checkpoints(found, tmp_path):
+def test_buffers_of_normalisation_of_old_checkpoints(found, saved, tmp_path):
     """LeRobot's processors have them now."""
-    made(found, "warm_smolvla").save_pretrained(tmp_path)
+    saved("warm_smolvla")
     old = {"normalize_inputs.buffer_observation_state.mean": torch.zeros(6)}
     edit(tmp_path, lambda weights: weights.update(old))
     load(found, "warm_smolvla", tmp_path)
@@ -128,10 +144,9 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_options_that_contradict_the_saved_ones(found, name, tmp_path):
-    policy = made(found, name, n_action_steps=4)
-    policy.save_pretrained(tmp_path)
-    kind = type(policy.config)
+def test_options_that_contradict_the_saved_ones(found, saved, name, tmp_path):
+    saved(name)
+    kind = found[name].config_class
     for option, value in CHANGES[name]:
         config = kind.from_pretrained(tmp_path)
         setattr(config, option, value)
@@ -143,14 +158,13 @@ def test_options_that_contradict_the_saved_ones(found, name, tmp_path):
     config.n_action_steps = 2
     loaded = load(found, name, tmp_path, config=config)
     assert loaded.config.n_action_steps == 2
-    with raises(TypeError, "n_action_step"):
-        load(found, name, tmp_path, n_action_step=3)
+    refuses(lambda: load(found, name, tmp_path, n_action_step=3), TypeError, "n_action_step")
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("prior", ["evil_module:Prior", "evil_module", "evil_module:Prior,sigma=0.1"])
-def test_a_prior_in_a_file_imports_nothing(found, name, prior, tmp_path, monkeypatch):
-    made(found, name).save_pretrained(tmp_path)
+def test_a_prior_in_a_file_imports_nothing(found, saved, name, prior, tmp_path, monkeypatch):
+    saved(name)
     content = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(content | {"prior": prior}))
     (tmp_path / "evil_module.py").write_text("raise SystemExit('ran')")

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import PreviewPrior
 from warmprior.history import ENTRIES
 from warmprior.lerobot.memory import ActionMemory
@@ -60,10 +60,8 @@ def test_an_episode_that_begins_inside_a_chunk():
 @pytest.mark.parametrize("steps", [1.5, torch.tensor([1.0, 2.5]), torch.tensor([1, 1, 1])])
 def test_counts_and_corrections_that_cannot_be(steps):
     memory = executing(PreviewPrior(3), 1)
-    with raises(ValueError, "executed_steps"):
-        memory.executed(steps)
-    with raises(ValueError, "the executed action"):
-        memory.correct(torch.zeros(2, 2))
+    refuses(lambda: memory.executed(steps), ValueError, "executed_steps")
+    refuses(lambda: memory.correct(torch.zeros(2, 2)), ValueError, "the executed action")
 
 
 def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():

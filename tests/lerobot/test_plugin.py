@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, VLA, flow_batch, flow_policy, small, warm
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
@@ -115,15 +115,13 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     check_pretrained(config, "user/policy", revision="v1")
     assert asked == {"revision": "v1"}
     config.prior_chunk = 4
-    with raises(ValueError, 3, "prior='past,sigma=0.0'", 4):
-        check_pretrained(config, str(tmp_path))
+    refuses(lambda: check_pretrained(config, str(tmp_path)), ValueError, 3, "prior='past,sigma=0.0'", 4)
     own.save_pretrained(tmp_path)
     config.pretrained_path = "elsewhere"  # where it once came from does not count
     with small("warm_groot"), raises(ValueError, "--policy.base_model_path"):
         found["warm_groot"].from_pretrained(tmp_path, config=config)
     before.steps[2].modality_config = {"action": {"action_configs": [{"rep": "relative"}]}}
-    with raises(ValueError, "embodiment_tag"):
-        before(dict(raw))
+    refuses(lambda: before(dict(raw)), ValueError, "embodiment_tag")
 
 
 @pytest.mark.parametrize("name", [*VLA, "warm_flow"])
@@ -140,7 +138,6 @@ def test_another_number_of_environments(found, name):
     for call in (policy.select_action, policy.predict_action_chunk):
         with raises(ValueError, 3, 2, "reset"):
             call(dict(batches[3]))
-    with raises(TypeError, "nfe"):
-        policy.select_action(dict(batches[2]), nfe=3)
+    refuses(lambda: policy.select_action(dict(batches[2]), nfe=3), TypeError, "nfe")
     policy.reset()
     assert len(policy.select_action(dict(batches[3]))) == 3

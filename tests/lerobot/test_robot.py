@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import refuses
 from tests.lerobot.plugin_policies import saved_flow_policy, small, warm
 from tests.lerobot.test_actor import preprocessed
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
@@ -49,8 +49,7 @@ def test_a_warm_policy_acts_as_its_own_loop_does(found, name):
         torch.manual_seed(1)
         found_actions = torch.stack([executor.act(observation) for observation in seen])
         assert executor.execute == LENGTH
-        with raises(KeyError, "top"):
-            executor.act({"state": np.zeros(STATE)})
+        refuses(lambda: executor.act({"state": np.zeros(STATE)}), KeyError, "top")
     assert found_actions.shape == (2 * LENGTH + 1, ACTION)
     torch.testing.assert_close(found_actions, torch.stack(expected))
 
@@ -59,15 +58,13 @@ def test_an_adapter_brings_policy_and_prior(policy):
     made, prior = policy("smolvla"), PastPrior(LENGTH)
     actor = LeRobotActor(WarmPriorAdapter(made, prior, nfe=2), preprocess=preprocessed)
     assert actor.prior is prior and actor.sampling.nfe == 2 and actor.ode.policy is made
-    with raises(ValueError, "prior"):
-        LeRobotActor(made)
+    refuses(lambda: LeRobotActor(made), ValueError, "prior")
     few = LeRobotActor(policy("smolvla", n_action_steps=2), prior, preprocess=preprocessed)
     for delay, execute in {0: 2, 1: 2, 4: 4}.items():  # as LeRobot's own loop does, if decisions are as fast
         with AsyncExecutor(few, delay=delay) as executor:
             assert executor.execute == execute
     guided = WarmPriorAdapter(policy("smolvla", n_action_steps=2), prior, guidance=RealTimeChunking())
-    with raises(ValueError, "guidance"):
-        LeRobotActor(guided)
+    refuses(lambda: LeRobotActor(guided), ValueError, "guidance")
 
 
 @pytest.mark.parametrize("camera", [False, True])

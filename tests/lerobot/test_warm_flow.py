@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.data.lerobot_parts import numbers, write_lerobot
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
 from warmprior import (
@@ -153,8 +153,7 @@ def test_losses_of_samples(found):
     torch.testing.assert_close((losses * count).sum() / count.sum(), mean)
     assert said["flow_matching"] == pytest.approx(losses.mean().item())
     assert policy.forward(batch)[0].ndim == 0
-    with raises(ValueError, "reduction", "mean, none"):
-        policy.forward(batch, reduction="sum")
+    refuses(lambda: policy.forward(batch, reduction="sum"), ValueError, "reduction", "mean, none")
 
 
 @pytest.mark.parametrize("prior", ["past,sigma=0.0", "preview,sigma=0.0"])
@@ -171,8 +170,7 @@ def test_fewer_actions_are_executed_than_remembered(found, prior, tmp_path):
     assert len(sources) == 3
     expected = actions[:, 2:6] if prior.startswith("past") else chunks[1][:, 3:7]
     assert torch.equal(sources[2][:, :4], expected)
-    with raises(ValueError, "n_action_steps", 4, 5):
-        flow_policy(found, prior_chunk=4, n_action_steps=5)
+    refuses(lambda: flow_policy(found, prior_chunk=4, n_action_steps=5), ValueError, "n_action_steps", 4, 5)
 
 
 def test_the_flow_policys_loss_is_algorithm_1(found):
@@ -215,8 +213,7 @@ def test_the_flow_policy_remembers(found):
     assert actions.abs().max() <= 1
     policy.reset()
     chunks = [policy.predict_action_chunk(dict(batch), executed_steps=4) for _ in range(2)]
-    with raises(ValueError, "executed_steps="):
-        policy.predict_action_chunk(dict(batch))
+    refuses(lambda: policy.predict_action_chunk(dict(batch)), ValueError, "executed_steps=")
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
     with raises(ValueError, "executed_steps"):
@@ -264,8 +261,7 @@ def test_the_flow_policy_sees_images(found, tmp_path):
         torch.manual_seed(7)
         actions.append(one.select_action({**start, "observation.images.top": flat}))
     assert actions[0].shape == (2, 2) and torch.equal(*actions)
-    with raises(KeyError, "images.top"):
-        policy.select_action(start)
+    refuses(lambda: policy.select_action(start), KeyError, "images.top")
     for options, fact in (({"encoder": "tiny"}, "resnet18-imagenet"), (standardised, "MEAN_STD")):
         with raises(ValueError, fact):
             flow_policy(found, images=(3, 16, 16), **options)
@@ -317,8 +313,7 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     chunk = actor(data)["vla_action", "chunk"]
     expected = actor.normalizer.denormalize(TensorDict({"action": chunk[:, 0]}, [1]))["action"]
     torch.testing.assert_close(action, expected)
-    with raises(FileExistsError, "folder"):
-        export_policy(tmp_path / "ours", out)
+    refuses(lambda: export_policy(tmp_path / "ours", out), FileExistsError, "folder")
     assert main([str(tmp_path / "ours"), str(tmp_path / "again")]) == 0
     for i, (options, fact) in enumerate(
         [
@@ -357,8 +352,7 @@ def test_the_environment_has_the_observations_of_converted_demonstrations():
     features = {name: entry.shape for name, entry in config.features.items()}
     assert features == {"action": (7,), "agent_pos": (STATE,), "environment_state": (OBJECT,)}
     batch.close()
-    with raises(ValueError, "task", "'life'"):
-        RobosuiteEnvConfig(task="life")
+    refuses(lambda: RobosuiteEnvConfig(task="life"), ValueError, "task", "'life'")
 
 
 JOINTS = ["pan", "lift", "gripper"]

@@ -8,7 +8,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import CountingEnv, Halfway, mlp_actor, random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, keys, policy_transforms
 from warmprior.history import ENTRIES, advance, cold_history
@@ -85,12 +85,9 @@ def test_one_evaluation_alone():
     prior = GaussianPrior(H)
     actor = actor_for(prior, max_nfe=1)
     assert (actor.sampling.evaluations(), actor_for(prior).sampling.evaluations()) == (1, 3)
-    with raises(ValueError, "at most 1", "nfe=3"):
-        actor_for(prior, nfe=3, max_nfe=1)
-    with raises(ValueError, "at most 1", "nfe=9"):
-        actor(batch(prior, 4), nfe=9)
-    with raises(ValueError, "guide"):
-        actor_for(prior, max_nfe=1, guidance=RealTimeChunking())
+    refuses(lambda: actor_for(prior, nfe=3, max_nfe=1), ValueError, "at most 1", "nfe=3")
+    refuses(lambda: actor(batch(prior, 4), nfe=9), ValueError, "at most 1", "nfe=9")
+    refuses(lambda: actor_for(prior, max_nfe=1, guidance=RealTimeChunking()), ValueError, "guide")
 
 
 def test_what_is_replaced_and_what_stays():
@@ -102,8 +99,7 @@ def test_what_is_replaced_and_what_stays():
     assert actor.replace(max_nfe=1).sampling.evaluations() == 1
     four = actor.replace(nfe=4)  # as of a saved policy, whose number was chosen
     assert four.replace(max_nfe=8).sampling.nfe == four.replace(prior=GaussianPrior(H)).sampling.nfe == 4
-    with raises(ValueError, "at most 1"):
-        four.replace(max_nfe=1)
+    refuses(lambda: four.replace(max_nfe=1), ValueError, "at most 1")
 
 
 def test_a_subclass_keeps_its_own_arguments():

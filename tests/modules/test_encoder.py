@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import random_history
 from warmprior import (
     FlowMatchingLoss,
@@ -127,16 +127,14 @@ def test_windows_follow_the_seed_and_evaluation_draws_none():
 
 def test_observations_that_do_not_fit():
     encoder = encoder_of()
-    with raises(KeyError, "['robot0_eye_in_hand_image']"):
-        encoder(observation_of(3).exclude(CAMERAS[1]))
+    refuses(lambda: encoder(observation_of(3).exclude(CAMERAS[1])), KeyError, "['robot0_eye_in_hand_image']")
     with raises(ValueError, "state", "[3, 2, 4]", "[3, 2, 3]"):
         encoder(observation_of(3).set("state", torch.zeros(3, 2, 4)))
     with raises(ValueError, "agentview_image", "[3, 2, 3, 9, 9]", "12, 12]"):
         encoder(observation_of(3, size=9))
     upright = observation_of(3)
     upright[CAMERAS[0]] = upright[CAMERAS[0]].movedim(-3, -1)
-    with raises(ValueError, "[3, 2, 12, 12, 3]"):
-        encoder(upright)
+    refuses(lambda: encoder(upright), ValueError, "[3, 2, 12, 12, 3]")
 
 
 def policy_of(network):
@@ -224,6 +222,5 @@ def test_stored_weights_that_are_damaged_or_hold_code(tmp_path, monkeypatch, sto
     else:
         Planted.folder = str(tmp_path / "ran")
         torch.save({"conv1.weight": stored}, path)
-    with raises(OSError, "ResNet-18"):
-        load_imagenet(encoder_of(backbone="resnet18"))
+    refuses(lambda: load_imagenet(encoder_of(backbone="resnet18")), OSError, "ResNet-18")
     assert not (tmp_path / "ran").exists()

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, lazy_stack
 from torch import nn
 
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import AdaLNTransformer, ChiTransformer, PlainMLP, VelocityMLP, VelocityNetwork
 from warmprior.modules.network import TimestepEmbedding, network_observation, velocity_field
 from warmprior.modules.registry import from_config
@@ -80,8 +80,7 @@ SIZES |= dict.fromkeys([AdaLNTransformer, ChiTransformer], "embedding_dim num_la
 )
 @pytest.mark.parametrize("value", [0, -3, 1.5])
 def test_a_size_that_cannot_work_is_named(kind, size, value):
-    with raises(ValueError, size, value):
-        kind(2, 3, 4, **{size: value})
+    refuses(lambda: kind(2, 3, 4, **{size: value}), ValueError, size, value)
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])

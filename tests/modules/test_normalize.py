@@ -7,7 +7,7 @@ from torchrl.data import Bounded, MultiOneHot
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import CountingEnv
 from warmprior import (
     Normalizer,
@@ -108,14 +108,11 @@ def test_whole_numbers_are_no_actions_of_a_policy(spec, kind):
 
 def test_errors():
     raw = data()
-    with raises(ValueError, "empty"):
-        Normalizer.fit(raw[:0])
-    with raises(KeyError, "['state']"):
-        Normalizer.fit(raw, ("state", "action"))
+    refuses(lambda: Normalizer.fit(raw[:0]), ValueError, "empty")
+    refuses(lambda: Normalizer.fit(raw, ("state", "action")), KeyError, "['state']")
     broken = raw.clone()
     broken["action"][3, 1] = float("nan")
-    with raises(ValueError, "action", "NaN", "3"):
-        Normalizer.fit(broken)
+    refuses(lambda: Normalizer.fit(broken), ValueError, "action", "NaN", "3")
     fitted = Normalizer.fit(raw)
     narrow = TensorDict({"observation": torch.rand(5, 1), "action": torch.rand(5, 1)}, [5])
     for key, wide in (("observation", 4), ("action", 2)):
@@ -132,10 +129,8 @@ def test_errors():
         with raises(KeyError, str(key), "observation", "rename"):
             TransformedEnv(CountingEnv(5), *normalizing_transforms(other)).reset()
     one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
-    with raises(ValueError, "a", "[2]", "[3]"):
-        Normalizer(one, two)
-    with raises(ValueError, "['a']", "['b']"):
-        Normalizer(one, {"b": torch.zeros(2)})
+    refuses(lambda: Normalizer(one, two), ValueError, "a", "[2]", "[3]")
+    refuses(lambda: Normalizer(one, {"b": torch.zeros(2)}), ValueError, "['a']", "['b']")
     with raises(ValueError, "a", "above"):  # the dimension would count as constant
         Normalizer(one, {"a": torch.tensor([1.0, -1.0])})
 
@@ -175,8 +170,7 @@ def test_units_of_their_own():
 def test_entries_of_an_observation_are_named_one_by_one():
     raw = data()
     raw["observation"] = TensorDict({"state": raw["observation"]}, [40])
-    with raises(ValueError, "['state']", "keys="):
-        Normalizer.fit(raw)
+    refuses(lambda: Normalizer.fit(raw), ValueError, "['state']", "keys=")
     nested = Normalizer.fit(raw, (("observation", "state"), "action"))
     assert nested.normalize(raw)["observation", "state"].amax() <= 1.0001
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
 from warmprior import (
     FlowMatchingLoss,
@@ -298,8 +298,7 @@ def test_paths_that_cannot_be():
 
 def test_windows_of_another_prior_and_with_keys_of_their_own():
     windows = buffer_of(gaussian_steps(episodes=2), PastPrior(2), 8).sample()
-    with raises(ValueError, 2, "PreviewPrior", 4):
-        SourceMoments.fit(windows, PreviewPrior(2))
+    refuses(lambda: SourceMoments.fit(windows, PreviewPrior(2)), ValueError, 2, "PreviewPrior", 4)
     flat = SourceMoments.fit(windows, PastPrior(2), generator=torch.Generator().manual_seed(0))
     folded = windows.reshape(2, 4)
     again = SourceMoments.fit(folded, PastPrior(2), generator=torch.Generator().manual_seed(0))

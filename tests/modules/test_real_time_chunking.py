@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import mlp_actor, stirred
 from warmprior import PastPrior, PreviewPrior, PriorDecoder, RealTimeChunking
 from warmprior.history import advance, cold_history, without
@@ -183,8 +183,7 @@ def test_options_and_delays_that_cannot_be():
             RealTimeChunking(**{name: value})
     _, y, left, delay = batch()
     late = delay + torch.tensor([[5], [0], [0]])
-    with raises(ValueError, "delay", 8, 7):
-        RealTimeChunking().guided(network(), y, left, late)
+    refuses(lambda: RealTimeChunking().guided(network(), y, left, late), ValueError, "delay", 8, 7)
     with raises(ValueError, "horizon=2", "delay", 3):
         RealTimeChunking(horizon=2).guided(network(), y, left, delay)
     for wrong in ((left[:2], delay), (left, delay.squeeze(1))):

@@ -4,7 +4,7 @@ from functools import partial
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import Learned, demonstrations, mlp_actor, random_history
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder
 from warmprior.modules.registry import from_config
@@ -90,8 +90,7 @@ def test_found_by_name_or_place():
         with raises(ValueError, "prior"):
             find(Prior, wrong)
     # A file may name a prior, but never a place to import.
-    with raises(ValueError, "unknown prior"):
-        from_config(Prior, {"name": place, "chunk_length": H})
+    refuses(lambda: from_config(Prior, {"name": place, "chunk_length": H}), ValueError, "unknown prior")
 
 
 def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):

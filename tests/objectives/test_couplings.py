@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.objectives.test_flow_matching import actor_for, sample
 from tests.toy_env import demonstrations, mlp_actor
 from warmprior import (
@@ -68,8 +68,7 @@ def test_moments_are_those_of_the_pairs():
 
 def test_what_cannot_be_paired():
     couple, chunk = OTCoupling(), torch.zeros(2, H, 1)
-    with raises(ValueError, 2):
-        couple(chunk[:1], chunk[:1], torch.zeros(1, 1, 3))
+    refuses(lambda: couple(chunk[:1], chunk[:1], torch.zeros(1, 1, 3)), ValueError, 2)
     for seen in (None, TensorDict({"pose": torch.zeros(2, 3)}, [2])):
         with raises(ValueError, "observation_weight=0"):
             couple(chunk, chunk, seen)
@@ -95,8 +94,7 @@ def test_reflow_pairs_sources_with_the_ends_of_the_teachers_flow():
     assert same is a0
     level = seen[:, :, :1]
     torch.testing.assert_close(target, level + 0.75**4 * (a0 - level))
-    with raises(ValueError, H + 1, H):
-        couple(torch.zeros(5, H + 1, 1), a1, seen)
+    refuses(lambda: couple(torch.zeros(5, H + 1, 1), a1, seen), ValueError, H + 1, H)
     for nfe in (0, 2.5, True):
         with raises(ValueError, "nfe"):
             ReflowCoupling(couple.teacher, nfe=nfe)

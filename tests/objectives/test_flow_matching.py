@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
 from tests.states import copied, same
 from tests.toy_env import mlp_actor, random_history
@@ -128,11 +128,10 @@ def test_batch_shapes_and_whole_numbers_agree():
     assert torch.equal(loss_of(actor, whole), loss_of(actor, numbers))  # as chunks of one-hot actions
 
 
-@pytest.mark.parametrize("times", ["uniform", "u-shaped"])
-def test_the_loss_compiles_for_every_batch_size(times):
+def test_the_loss_compiles_for_every_batch_size():
     prior = PastPrior(H, correlation=0.5)
     actor = actor_for(prior).replace(generator=None)
-    loss = FlowMatchingLoss(actor, times=times)
+    loss = FlowMatchingLoss(actor, times="u-shaped")  # uniform ones are drawn first
     compiled = torch.compile(loss, backend="eager")
     for count in (3, 5, 7):
         data, found = sample(prior, count), []
@@ -304,8 +303,7 @@ def test_windows_in_raw_units_are_refused_where_the_policy_has_a_normaliser():
         name: window_replay_buffer(data, PastPrior(H), batch_size=25)[:]
         for name, data in (("raw", raw), ("normalised", normalizer.normalize(raw)))
     }
-    with raises(ValueError, "normalize(data)", "+-1"):
-        loss(windows["raw"])
+    refuses(lambda: loss(windows["raw"]), ValueError, "normalize(data)", "+-1")
     again = FlowMatchingLoss(loss.actor_network)
     windows["normalised"][keys.CHUNK] *= 1.5
     assert float(again(windows["normalised"])["loss_flow_matching"]) < 100

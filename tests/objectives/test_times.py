@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import refuses
 from tests.objectives.test_flow_matching import actor_for, loss_of, sample
 from warmprior import FlowMatchingLoss, PastPrior
 from warmprior.objectives.times import TIMES
@@ -53,6 +53,5 @@ def test_the_loss_is_given_them():
 
 def test_a_coupling_with_times_takes_no_others():
     actor, coupling = actor_for(PastPrior(4)), SimpleNamespace(times=TIMES["start"])
-    with raises(ValueError, "u-shaped"):
-        FlowMatchingLoss(actor, coupling=coupling, times="u-shaped")
+    refuses(lambda: FlowMatchingLoss(actor, coupling=coupling, times="u-shaped"), ValueError, "u-shaped")
     assert FlowMatchingLoss(actor, coupling=coupling).times is TIMES["start"]

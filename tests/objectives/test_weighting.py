@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.paths import TrigonometricInterpolant
 from warmprior import (
     FlowMatchingLoss,
@@ -85,7 +85,6 @@ def test_errors_are_divided_coordinate_by_coordinate():
 
 def test_networks_without_a_unit_are_refused():
     actor = WarmPriorActor(VelocityMLP(D_A, 1, H, 1, hidden_dim=8), GaussianPrior(H))
-    with raises(ValueError, "PreconditionedNetwork"):
-        FlowMatchingLoss(actor, weighting="standardised")
+    refuses(lambda: FlowMatchingLoss(actor, weighting="standardised"), ValueError, "PreconditionedNetwork")
     with raises(ValueError, "weighting", "velocity, standardised"):
         FlowMatchingLoss(actor, weighting="loud")

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.states import same
 from tests.toy_env import Halfway, random_history
 from warmprior import (
@@ -133,8 +133,7 @@ def test_a_full_disk_leaves_the_old_policy(tmp_path, monkeypatch, where):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(where, full)
-    with raises(OSError, tmp_path, "No space left"):
-        saved(tmp_path, PastPrior(H, sigma=0.7))
+    refuses(lambda: saved(tmp_path, PastPrior(H, sigma=0.7)), OSError, tmp_path, "No space left")
     monkeypatch.undo()
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
@@ -153,8 +152,7 @@ def test_damage_is_noticed(tmp_path, damage):
     path.write_bytes(content)
     if damage == "plain":  # of something else
         save_file({"weight": torch.ones(2)}, path)
-    with raises(ValueError, "model.safetensors"):
-        load_policy(tmp_path)
+    refuses(lambda: load_policy(tmp_path), ValueError, "model.safetensors")
 
 
 @pytest.mark.parametrize(
@@ -180,8 +178,7 @@ def test_damage_is_noticed(tmp_path, damage):
 def test_parts_that_do_not_fit_each_other(tmp_path, change, facts):
     saved(tmp_path)
     rewrite(tmp_path, change)
-    with raises(ValueError, tmp_path / "model.safetensors", *facts):
-        load_policy(tmp_path)
+    refuses(lambda: load_policy(tmp_path), ValueError, tmp_path / "model.safetensors", *facts)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0, -1.0, 1e30, -1e30])
@@ -192,8 +189,7 @@ def test_a_policy_that_is_loaded_is_finite(tmp_path, name, value):
     if name == WEIGHT and abs(value) <= 1:
         load_policy(tmp_path)
         return
-    with raises(ValueError, tmp_path, name):
-        load_policy(tmp_path)
+    refuses(lambda: load_policy(tmp_path), ValueError, tmp_path, name)
 
 
 @pytest.mark.parametrize(
@@ -240,17 +236,14 @@ def test_a_copy_of_the_configuration_that_differs_is_reported(tmp_path):
 
 
 def test_files_that_are_none(tmp_path):
-    with raises(FileNotFoundError, "nowhere", "model.safetensors"):
-        load_policy(tmp_path / "nowhere")
+    refuses(lambda: load_policy(tmp_path / "nowhere"), FileNotFoundError, "nowhere", "model.safetensors")
     for version in (FORMAT - 1, None, str(FORMAT)):
         saved(tmp_path)
         rewrite(tmp_path, lambda tensors, config, version=version: config.update(format=version))
-        with raises(ValueError, "format", FORMAT):
-            load_policy(tmp_path)
+        refuses(lambda: load_policy(tmp_path), ValueError, "format", FORMAT)
     (tmp_path / "model.safetensors").unlink()
     os.mkfifo(tmp_path / "model.safetensors")
-    with raises(ValueError, "regular file"):
-        load_policy(tmp_path)
+    refuses(lambda: load_policy(tmp_path), ValueError, "regular file")
 
 
 def _save_in_a_loop(folder, started):
@@ -289,5 +282,4 @@ def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
 def test_what_it_was_trained_on_has_the_form_that_is_printed(tmp_path, entry, value):
     saved(tmp_path, recording=Recording("arm", 2, 9, "[2]", {"joints": D_O}))
     rewrite(tmp_path, lambda tensors, config: config["recording"].update({entry: value}))
-    with raises(ValueError, tmp_path):
-        load_policy(tmp_path)
+    refuses(lambda: load_policy(tmp_path), ValueError, tmp_path)

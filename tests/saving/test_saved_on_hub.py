@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.io.hub_server import TOKEN, Repository, model_hub
 from tests.toy_env import mlp_actor, random_history
 from warmprior import Normalizer, PastPrior
@@ -73,8 +73,7 @@ def test_revisions(hub, actor):
     for revision, mine in ((None, other), (first, actor), ("steady", actor)):
         again = load_policy(NAME, revision=revision)
         assert torch.equal(chunk(again), chunk(mine))
-    with raises(OSError, "v9"):
-        load_policy(NAME, revision="v9")
+    refuses(lambda: load_policy(NAME, revision="v9"), OSError, "v9")
 
 
 def test_a_folder_is_a_folder(hub, actor, tmp_path):
@@ -85,20 +84,17 @@ def test_a_folder_is_a_folder(hub, actor, tmp_path):
     for name in ("missing", "a/b/c", "../someone", f"{tmp_path}/missing", tmp_path / "missing"):
         with raises(FileNotFoundError, "no policy"):
             load_policy(name)
-    with raises(ValueError, "revision='main'"):
-        load_policy(NAME, revision="main")
+    refuses(lambda: load_policy(NAME, revision="main"), ValueError, "revision='main'")
     assert not hub.requests
 
 
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
-    with raises(ValueError, NAME, "public"):
-        push_policy(actor, NAME, private=True)
+    refuses(lambda: push_policy(actor, NAME, private=True), ValueError, NAME, "public")
     assert not hub.files(NAME) and not hub.objects
 
 
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
-    with raises(ValueError, "config.json"):
-        load_policy(NAME)
+    refuses(lambda: load_policy(NAME), ValueError, "config.json")
     assert not [r for r in hub.requests if r.endswith("model.safetensors")]

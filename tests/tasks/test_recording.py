@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.errors import missing, raises
+from tests.errors import missing, raises, refuses
 from warmprior import GaussianPrior, PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
@@ -131,16 +131,14 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", **{name: SEEN[name]}))
     with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
         Task(demonstrations)
-    with raises(DatasetError, f"'{name}'"):
-        Task(demonstrations, joints="robot0_eef_pos")
+    refuses(lambda: Task(demonstrations, joints="robot0_eef_pos"), DatasetError, f"'{name}'")
     named = ["robot0_eef_pos", name]
     assert list(Task(demonstrations, observations=named).recording.observations) == named
 
 
 def test_who_names_the_joints_wants_to_see_them(tmp_path):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", joints=moved(0)))
-    with raises(DatasetError, "'joints'"):
-        Task(demonstrations)
+    refuses(lambda: Task(demonstrations), DatasetError, "'joints'")
     assert Task(demonstrations, joints="joints").recording.observations["joints"] == 3
 
 
@@ -198,8 +196,7 @@ def test_other_actions_are_as_recorded(tmp_path, names, near):
     task = Task(demonstrations)
     assert task.rest is None and not missing(task.recording.text(), "joints=")
     if near > 1:
-        with raises(ValueError, "observation", "units"):
-            Task(demonstrations, joints="observation.state")
+        refuses(lambda: Task(demonstrations, joints="observation.state"), ValueError, "observation", "units")
 
 
 def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_path, capsys):
@@ -237,8 +234,7 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert torch.equal(*actions)
     with raises(ValueError, "observation.state", 6), AsyncExecutor(policy, latency=0) as executor:
         executor.act(theirs | {"observation.state": effort})
-    with raises(ValueError, "control_rate=50", 30):
-        AsyncExecutor(policy, control_rate=50)
+    refuses(lambda: AsyncExecutor(policy, control_rate=50), ValueError, "control_rate=50", 30)
 
 
 def test_the_next_command_of_a_training_without_an_environment_runs_as_it_is_printed(tmp_path, capsys):

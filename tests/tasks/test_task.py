@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from lab.demonstrations.data_options import DataOptions
 from lab.demonstrations.tasks import load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, RestingJoints, RestingTrend, keys
@@ -286,8 +286,7 @@ def test_an_option_that_cannot_be_applied_is_refused(path, tmp_path, options, na
     ],
 )
 def test_an_argument_of_another_kind_is_named(path, call, named):
-    with raises((TypeError, ValueError), named):
-        call(path)
+    refuses(lambda: call(path), (TypeError, ValueError), named)
 
 
 def test_part_of_a_file_is_its_first_demonstrations(path):
@@ -299,8 +298,7 @@ def test_part_of_a_file_is_its_first_demonstrations(path):
     assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
     mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
     assert torch.allclose(mine, theirs[:30], atol=1e-6)
-    with raises(DatasetError, 2, "demos=3"):
-        Task(open_demonstrations(path, demos=3))
+    refuses(lambda: Task(open_demonstrations(path, demos=3)), DatasetError, 2, "demos=3")
 
 
 def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):

@@ -95,7 +95,7 @@ def test_the_loop_by_hand(tmp_path, options):
     ("stop", "recipe", "options"),
     [
         *((6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True})),
-        *((16, LATER, {}), (16, PUBLIC, {}), (16, {"precision": "bf16"}, {})),
+        (16, LATER | PUBLIC | {"precision": "bf16"}, {}),
     ],
 )
 def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):

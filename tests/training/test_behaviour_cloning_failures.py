@@ -6,7 +6,7 @@ import tempfile
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, finished, mlp, training, weights
 from warmprior import PastPrior, PreviewPrior
@@ -41,8 +41,7 @@ def test_a_full_disk(tmp_path, monkeypatch):
         return replace(*args)
 
     monkeypatch.setattr(os, "replace", failing)
-    with raises(OSError, tmp_path):
-        cloning.run()
+    refuses(lambda: cloning.run(), OSError, tmp_path)
     monkeypatch.undo()
     whole = finished(tmp_path / "whole")
     again = training(tmp_path)  # what was there before can be read, and training goes on
@@ -79,8 +78,7 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
         return out
 
     cloning.update.loss_module.forward = broken
-    with raises(FloatingPointError, "the loss", "NaN", "state.safetensors"):
-        cloning.run()
+    refuses(lambda: cloning.run(), FloatingPointError, "the loss", "NaN", "state.safetensors")
     tensors, facts = load_state(tmp_path / "state.safetensors")
     assert facts["iteration"] < bad
     assert all(torch.isfinite(v).all() for v in tensors.values() if v.is_floating_point())

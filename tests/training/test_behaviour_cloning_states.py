@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, finished, run_until, training, weights
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -26,8 +26,7 @@ def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):
     content = bytearray(path.read_bytes())
     content[-40_000] ^= 4
     path.write_bytes(content)
-    with raises(ValueError, "state.safetensors"):
-        training(tmp_path)
+    refuses(lambda: training(tmp_path), ValueError, "state.safetensors")
 
 
 def test_a_finished_policy_gets_the_sampling_that_is_asked_for(tmp_path):
@@ -46,8 +45,7 @@ def test_a_state_of_another_kind_of_device_is_not_called_damaged(tmp_path):
     tensors, facts = load_state(state)
     facts["identity"]["device"] = "cuda"
     save_state(state, tensors, facts)
-    with raises(ValueError, "device was cuda and is cpu"):
-        training(tmp_path)
+    refuses(lambda: training(tmp_path), ValueError, "device was cuda and is cpu")
 
 
 class Plain(nn.Module):

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.states import copied, same
 from tests.together import together
 from tests.toy_env import demonstrations, random_history
@@ -173,8 +173,7 @@ class NaNChunk(MeanChunk):
 
 
 def test_what_diverges_is_not_kept(tmp_path):
-    with raises(FloatingPointError, "NaNChunk"):
-        policy_of(tmp_path, NaNChunk(H))
+    refuses(lambda: policy_of(tmp_path, NaNChunk(H)), FloatingPointError, "NaNChunk")
     assert not (tmp_path / "prior.safetensors").exists()
 
 
@@ -185,8 +184,7 @@ def test_what_it_cannot_read_is_refused_by_name(tmp_path):
     network = NetworkOptions(hidden_dim=8, encoder="small", crop_size=10)
     with raises(ValueError, "CVAEPrior", "vectors", "images"):
         policy_of(tmp_path, CVAEPrior(H), data.set("observation", seen), network=network)
-    with raises(ValueError, "see_history"):
-        policy_of(tmp_path, CVAEPrior(H), see_history=True)
+    refuses(lambda: policy_of(tmp_path, CVAEPrior(H), see_history=True), ValueError, "see_history")
     assert not list(tmp_path.iterdir())
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior.training.placement import Prefetch
 
 
@@ -30,5 +30,4 @@ def test_an_error_of_the_thread_is_told_where_the_batch_is_asked_for():
     def failing():
         raise OSError("the disk is gone")
 
-    with raises(OSError, "the disk is gone"):
-        Prefetch(failing, torch.Generator())()
+    refuses(lambda: Prefetch(failing, torch.Generator())(), OSError, "the disk is gone")

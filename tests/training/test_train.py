@@ -8,7 +8,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from lab.demonstrations.tasks import navigation_task
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations
 from warmprior import ChiTransformer, HistoryObservation, PastPrior, policy_transforms
@@ -24,11 +24,11 @@ from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)
+OPTIONS = {"network": NETWORK, "training": CONFIG, "description": None}
 
 
-def train(folder, prior=None, training=CONFIG, **options):
-    options |= {"network": NETWORK, "training": training, "description": None}
-    return train_policy(navigation_task(), prior or PastPrior(4), folder, **options)
+def train(folder, prior=None, **options):
+    return train_policy(navigation_task(), prior or PastPrior(4), folder, **OPTIONS | options)
 
 
 def equal(one, two):
@@ -61,8 +61,7 @@ def test_gradients_that_rollouts_hold_make_no_difference():
     for of in (torch.Tensor.clone, lambda value: value.clone().requires_grad_() * 1):
         steps = {name: of(value) for name, value in values.items()}
         steps = TensorDict(steps | {"episode": torch.arange(60) // 20}, [60])
-        options = {"network": NETWORK, "training": CONFIG, "description": None}
-        policies.append(train_policy(steps, PastPrior(4), **options))
+        policies.append(train_policy(steps, PastPrior(4), **OPTIONS))
     assert equal(*policies)
 
 
@@ -78,8 +77,7 @@ def test_scripts_in_double_precision_train_and_play(doubles, tmp_path, dtype):
     steps = demonstrations(d_o=2 + ACTION_DIM).apply(
         lambda value: value.to(dtype) if value.ndim > 1 else value
     )
-    options = {"network": NETWORK, "training": CONFIG, "description": None}
-    policy = train_policy(steps, PastPrior(4), tmp_path, **options)
+    policy = train_policy(steps, PastPrior(4), tmp_path, **OPTIONS)
     assert {value.dtype for value in policy.state_dict().values()} == {torch.float64}
     env = TransformedEnv(CountingEnv(5), policy_transforms(policy))
     assert env.rollout(3, policy)["vla_action", "chunk"].dtype == torch.float64
@@ -94,9 +92,8 @@ def test_a_replay_buffer_that_has_overwritten_steps_is_refused():
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(room))
         for part in steps.split(20):
             buffer.extend(part)
-        options = {"network": NETWORK, "training": CONFIG, "description": None}
         with raises(ValueError, "storage") if refused else nullcontext():
-            train_policy(buffer, PastPrior(4), **options)
+            train_policy(buffer, PastPrior(4), **OPTIONS)
 
 
 @pytest.mark.parametrize("turned_off", [False, True])
@@ -119,10 +116,8 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
 
 
 def test_what_does_not_exist_is_refused_with_what_does():
-    with raises(ValueError, "style", "'ph'"):
-        navigation_task("ph")
-    with raises(ValueError, "network", "mlp, plain_mlp", "'nonsense'"):
-        NetworkOptions(network="nonsense")
+    refuses(lambda: navigation_task("ph"), ValueError, "style", "'ph'")
+    refuses(lambda: NetworkOptions(network="nonsense"), ValueError, "network", "mlp, plain_mlp", "'nonsense'")
     with raises(ValueError, "encoder", "resnet18, small", "'resnet18-imagnet'"):
         NetworkOptions(encoder="resnet18-imagnet")  # its weights would be random
 
@@ -146,8 +141,7 @@ def test_options_of_transformers_reach_them_alone(name, value):
     for network in ("mlp", "plain_mlp"):
         with raises(ValueError, name, "chi_transformer and adaln_transformer", network):
             NetworkOptions(network, **{name: value})
-    with raises(ValueError, name, -1):
-        NetworkOptions("chi_transformer", **{name: -1})
+    refuses(lambda: NetworkOptions("chi_transformer", **{name: -1}), ValueError, name, -1)
 
 
 def test_options_of_images_are_refused_without_images():
@@ -185,8 +179,7 @@ class Long(PastPrior):
 
 
 def test_networks_see_all_that_a_prior_remembers():
-    options = {"network": NETWORK, "training": CONFIG, "see_history": True, "nfe": 1, "description": None}
-    policy = train_policy(task := navigation_task(), Long(4), **options)
+    policy = train_policy(task := navigation_task(), Long(4), see_history=True, nfe=1, **OPTIONS)
     width = task.vector.shape[-1]
     assert policy.network.observation_dim == width + HistoryObservation.width(7, 1)
     with AsyncExecutor(policy, latency=0) as executor:

@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ExcludeTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import PLACES, CountingEnv, placed
 from warmprior import GaussianPrior
 from warmprior.modules.normalize import Normalizer
@@ -178,15 +178,12 @@ def test_grippers_go_where_they_are_told(env):
 
 
 def test_refusals():
-    with raises(ValueError, "output_max", [6], [3]):
-        AbsoluteActions([0.05] * 3)
+    refuses(lambda: AbsoluteActions([0.05] * 3), ValueError, "output_max", [6], [3])
     two_arms = AbsoluteActions(SCALE, torch.eye(3).expand(2, 3, 3))
-    with raises(ValueError, 2, 14, 7):
-        TransformedEnv(Gripper(), two_arms).full_action_spec  # noqa: B018
+    refuses(lambda: TransformedEnv(Gripper(), two_arms).full_action_spec, ValueError, 2, 14, 7)
     with raises(KeyError, "eef_pose=True"):
         blind = TransformedEnv(Gripper(), ExcludeTransform("eef_pose"))
         TransformedEnv(blind, AbsoluteActions(SCALE)).full_action_spec  # noqa: B018
     env = TransformedEnv(Gripper(), AbsoluteActions(SCALE))
     env.reset()
-    with raises(KeyError, "reset"):
-        env.step(TensorDict({"action": torch.zeros(10)}))
+    refuses(lambda: env.step(TensorDict({"action": torch.zeros(10)})), KeyError, "reset")

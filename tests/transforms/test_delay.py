@@ -9,7 +9,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from lab.measures.source_errors import mean_revision
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, closing
 from warmprior import GaussianPrior, InferenceDelay, PastPrior, PreviewPrior, keys, policy_transforms
 from warmprior.diagnostics import executed_actions, smoothness
@@ -181,16 +181,12 @@ def test_specs_and_jumps_where_chunks_take_effect():
 
 
 def test_numbers_that_do_not_go_together():
-    with raises(ValueError, "delay", 4, 3):
-        InferenceDelay(4, execute=3)
-    with raises(ValueError, "delay", 0):
-        InferenceDelay(1.5, execute=3)
+    refuses(lambda: InferenceDelay(4, execute=3), ValueError, "delay", 4, 3)
+    refuses(lambda: InferenceDelay(1.5, execute=3), ValueError, "delay", 0)
     with raises(ValueError, 6, 5, "delay", 2, 4):
         TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)).reset()
-    with raises(ValueError, "delay", 4, 6, 3):
-        policy_transforms(PRIORS["past"], delay=4)
+    refuses(lambda: policy_transforms(PRIORS["past"], delay=4), ValueError, "delay", 4, 6, 3)
     # As many as the delay leaves are executed.
     whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
     assert whole.rollout(2, lagging(6))["next", "executed_steps"].flatten().tolist() == [4, 4]
-    with raises(KeyError, "delay"):
-        whole.step(lagging(6)(whole.reset()).exclude("rtc"))
+    refuses(lambda: whole.step(lagging(6)(whole.reset()).exclude("rtc")), KeyError, "delay")

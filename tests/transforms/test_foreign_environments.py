@@ -19,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, demonstrations, mlp_actor
 from warmprior import (
     ActionHistory,
@@ -123,8 +123,7 @@ def every_second(tensordict):
 
 def test_a_chunk_is_not_repeated():
     env = TransformedEnv(CountingEnv(30), Compose(*policy_transforms(PRIOR), FrameSkipTransform(2)))
-    with raises(RuntimeError, "FrameSkipTransform", "before"):
-        env.reset()
+    refuses(lambda: env.reset(), RuntimeError, "FrameSkipTransform", "before")
     env = TransformedEnv(CountingEnv(30), Compose(FrameSkipTransform(2), *policy_transforms(PRIOR)))
     assert env.step(POLICY(env.reset()))["next", keys.EXECUTED] == H
 
@@ -164,8 +163,7 @@ def test_single_steps_are_not_skipped():
     skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
     transforms = Compose(ObservationStack(1), skip, ChunkStep(H), ActionHistory(H))
     env = TransformedEnv(CountingEnv(9), transforms)
-    with raises(RuntimeError, "ConditionalSkip"):
-        env.rollout(2, POLICY)
+    refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
 
 
 @pytest.mark.parametrize("batch", [SerialEnv, None])
@@ -176,8 +174,7 @@ def test_single_steps_are_not_skipped_inside_of_workers_either(batch):
 
     base = skipping() if batch is None else batch(2, skipping)
     env = TransformedEnv(base, Compose(*policy_transforms(PRIOR)), auto_unwrap=False)
-    with raises(RuntimeError, "ConditionalSkip"):
-        env.rollout(2, POLICY)
+    refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
     env.close()
 
 
@@ -230,8 +227,7 @@ def test_observations_of_other_shapes_in_other_rows():
     after = env.step(POLICY(env.reset()))["next"]
     assert [row["points"].unique().tolist() for row in after.unbind(0)] == [[4.0], [4.0]]
     env = TransformedEnv(SerialEnv(2, [partial(Points, n) for n in lengths]), policy_transforms(PRIOR))
-    with raises(RuntimeError, "['points']"):
-        env.step(POLICY(env.reset()))
+    refuses(lambda: env.step(POLICY(env.reset())), RuntimeError, "['points']")
 
 
 class PerAgent(CountingEnv):
@@ -259,8 +255,7 @@ def test_environments_that_chunks_do_not_fit():
 
 def test_a_number_and_text_are_no_observations():
     data = demonstrations().set("observation", torch.zeros(60))
-    with raises(ValueError, "'observation'"):
-        window_replay_buffer(data, PRIOR, batch_size=4)
+    refuses(lambda: window_replay_buffer(data, PRIOR, batch_size=4), ValueError, "'observation'")
     words = NonTensorStack(*["go"] * 60)
     group = TensorDict({"state": torch.zeros(60, 2), "task": words}, [60])
     for seen, key in ((words, "'observation'"), (group, "'task'")):

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import (
     ACTION_DIM,
     PLACES,
@@ -90,18 +90,14 @@ def test_parts_that_do_not_go_together():
     for behind in ([], [ChunkStep(3)]):
         with raises(KeyError, "ChunkStep"):
             TransformedEnv(CountingEnv(5), Compose(ActionHistory(3), *behind)).reset()
-    with raises(ValueError, "history_length", 0):
-        ActionHistory(0)
+    refuses(lambda: ActionHistory(0), ValueError, "history_length", 0)
     # More executed than remembered.
     env = TransformedEnv(CountingEnv(9), Compose(ChunkStep(3), ActionHistory(2)))
-    with raises(ValueError, 3, 2):
-        env.rollout(2)
+    refuses(lambda: env.rollout(2), ValueError, 3, 2)
     # An environment made for another prior, and a policy that meets it.
     env = TransformedEnv(CountingEnv(9), policy_transforms(PastPrior(3)))
-    with raises(ValueError, "PreviewPrior", 6, 3):
-        env.rollout(2, mlp_actor(PreviewPrior(3), nfe=1))
-    with raises(ValueError, "[*B, 3, d_a]", "(6, 2)"):
-        env.rollout(2, random_policy(6))
+    refuses(lambda: env.rollout(2, mlp_actor(PreviewPrior(3), nfe=1)), ValueError, "PreviewPrior", 6, 3)
+    refuses(lambda: env.rollout(2, random_policy(6)), ValueError, "[*B, 3, d_a]", "(6, 2)")
     with raises(KeyError, "ActionHistory", "'history'"):
         env.step(env.rand_action(env.reset()).exclude("history"))
 
@@ -129,11 +125,9 @@ def test_the_last_actions_are_part_of_the_observation():
 def test_keys_that_it_lacks_are_named():
     data = TensorDict({"observation": torch.zeros(1, 2, 4)}, [1])
     lacking = f"missing: {[keys.ACTIONS, keys.STEPS]}"
-    with raises(KeyError, lacking):
-        HistoryObservation()(data)
+    refuses(lambda: HistoryObservation()(data), KeyError, lacking)
     env = TransformedEnv(CountingEnv(5), HistoryObservation())
-    with raises(KeyError, lacking, "ActionHistory"):
-        _ = env.observation_spec
+    refuses(lambda: env.observation_spec, KeyError, lacking, "ActionHistory")
     data["history"] = random_history(GaussianPrior(3), 1)
     with raises(KeyError, "missing: [('prior', 'observation')]"):
         mlp_actor(GaussianPrior(3), observation_dim=11, observation_key=keys.CONDITIONED)(data)

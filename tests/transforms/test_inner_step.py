@@ -16,7 +16,7 @@ from torchrl.envs import (
 from torchrl.envs.transforms import Transform, VecNormV2
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import refuses
 from tests.states import same
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, closing
 from warmprior import ChunkStep, ObservationStack
@@ -145,5 +145,4 @@ def test_statistics_see_every_control_step_once(nested):
 
 
 def test_outside_an_environment():
-    with raises(RuntimeError, "ChunkStep"):
-        InnerStep(ChunkStep(H))
+    refuses(lambda: InnerStep(ChunkStep(H)), RuntimeError, "ChunkStep")

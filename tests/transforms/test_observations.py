@@ -7,7 +7,7 @@ from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import refuses
 from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, closing, placed
 from warmprior import (
     ActionWindow,
@@ -149,5 +149,4 @@ def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
     actions = torch.zeros(shape, dtype=dtype)
     data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
-    with raises(ValueError, "'action'", "[N, d_a]", "(9"):
-        ActionWindow(data, H)
+    refuses(lambda: ActionWindow(data, H), ValueError, "'action'", "[N, d_a]", "(9")

@@ -21,7 +21,13 @@ from warmprior import (
 H = 3
 
 
-class DoubleEnv(CountingEnv):
+class StrictEnv(CountingEnv):
+    def _step(self, tensordict):
+        assert tensordict["action"].dtype == self.action_spec.dtype
+        return super()._step(tensordict)
+
+
+class DoubleEnv(StrictEnv):
     def __init__(self, length=7):
         super().__init__(length)
         self.observation_spec = Composite(observation=Unbounded((4,), dtype=torch.float64))
@@ -60,37 +66,21 @@ def test_training_gives_the_loss_of_full_precision(data, network):
     torch.testing.assert_close(found.double(), exact.double(), rtol=tolerance, atol=0)
 
 
-@pytest.mark.parametrize("network", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("env_class", [CountingEnv, DoubleEnv])
+@pytest.mark.parametrize("network", [torch.float32, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("env_class", [StrictEnv, DoubleEnv])
 @pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
-def test_environments_keep_their_precision(prior_class, env_class, network):
-    prior = prior_class(H)
-    normalizer = Normalizer.fit(steps(torch.float64))
+def test_a_cast_policy_acts_in_the_precision_of_its_environment(prior_class, env_class, network):
+    actor = actor_of(prior_class(H), torch.float32).replace(normalizer=Normalizer.fit(steps(torch.float64)))
     base = SerialEnv(2, [partial(env_class, n) for n in (7, 4)])
-    env = TransformedEnv(base, policy_transforms(prior, normalizer=normalizer))
-    check_env_specs(env)
-    rollout = env.rollout(5, actor_of(prior, network), break_when_any_done=False)
-    dtype = torch.float64 if env_class is DoubleEnv else torch.float32
-    for key in ("observation", ("history", "actions"), ("prior", "loc"), ("vla_action", "chunk")):
-        assert rollout[key].dtype == dtype, key
-    warm = rollout["prior", "warm"]
-    assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
-
-
-@pytest.mark.parametrize("network", [torch.bfloat16, torch.float64])
-@pytest.mark.parametrize("env_class", [CountingEnv, DoubleEnv])
-def test_a_cast_policy_acts_in_the_precision_of_its_environment(env_class, network):
-    class Strict(env_class):
-        def _step(self, tensordict):
-            assert tensordict["action"].dtype == self.action_spec.dtype
-            return super()._step(tensordict)
-
-    actor = actor_of(PastPrior(H), torch.float32).replace(normalizer=Normalizer.fit(steps(torch.float32)))
-    env = TransformedEnv(Strict(7), policy_transforms(actor.to(network)))
+    env = TransformedEnv(base, policy_transforms(actor.to(network)))
     check_env_specs(env)
     rollout = env.rollout(5, actor, break_when_any_done=False)
-    for key in (("history", "actions"), ("vla_action", "chunk")):
-        assert rollout[key].dtype == env.base_env.action_spec.dtype, key
+    dtype = torch.float64 if env_class is DoubleEnv else torch.float32
+    for key in (("history", "actions"), ("prior", "loc"), ("vla_action", "chunk")):
+        assert rollout[key].dtype == dtype, key
+    assert rollout["observation"].dtype == (torch.float64 if network == torch.float64 else dtype)
+    warm = rollout["prior", "warm"]
+    assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
 
 
 def test_batches_come_to_the_network():

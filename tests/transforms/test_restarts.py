@@ -23,7 +23,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import ends_of
 from warmprior import PastPrior, keys, policy_transforms
 from warmprior.history import ENTRIES
@@ -131,8 +131,7 @@ def test_native_autoresets_without_resets_of_rows_take_single_steps():
     env = TransformedEnv(native(resets=False), policy_transforms(PRIOR, execute=1))
     check_equal(played(env), reference(LENGTHS, 1))
     env = TransformedEnv(native(resets=False), policy_transforms(PRIOR, execute=2))
-    with raises(RuntimeError, "Rows", "execute=1"):
-        played(env)
+    refuses(lambda: played(env), RuntimeError, "Rows", "execute=1")
 
 
 @pytest.mark.parametrize("execute", [1, 3])
@@ -161,8 +160,7 @@ def test_autoresets_of_torchrl_take_single_steps(append):
         return base
 
     check_equal(played(env(1)), reference(LENGTHS, 1))
-    with raises(RuntimeError, "execute=1"):
-        played(env(3))
+    refuses(lambda: played(env(3)), RuntimeError, "execute=1")
     check_equal(played(env(3, (6,))), reference((6,), 3))  # one row alone stops at its end
 
 
@@ -236,8 +234,7 @@ def test_vector_environments_that_restart_in_the_same_step(nested):
 def test_vector_environments_that_restart_a_step_late_are_refused(execute):
     # TorchRL's GymWrapper refuses the mode, and its GymEnv takes it.
     env = TransformedEnv(GymEnv("Pendulum-v1", num_envs=2), policy_transforms(PRIOR, execute=execute))
-    with raises(RuntimeError, "NEXT_STEP", "AutoresetMode.DISABLED"):
-        env.rollout(2)
+    refuses(lambda: env.rollout(2), RuntimeError, "NEXT_STEP", "AutoresetMode.DISABLED")
     env.close()
 
 

@@ -14,7 +14,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.toy_env import CountingEnv, mlp_actor
 from warmprior import (
     ActionHistory,
@@ -128,8 +128,7 @@ def test_what_knows_the_usual_keys_alone_says_so(tmp_path):
 def test_an_action_that_nobody_chooses_is_refused(keys):
     with raises(KeyError, "left", "right", "action_keys"):
         TransformedEnv(TwoArms(), ChunkStep(H, action_keys=keys, chunk_keys=keys)).rollout(1)
-    with raises(ValueError, "chunk_key", "action_key"):
-        ChunkStep(H, action_keys=keys, chunk_keys=[])
+    refuses(lambda: ChunkStep(H, action_keys=keys, chunk_keys=[]), ValueError, "chunk_key", "action_key")
 
 
 @pytest.mark.parametrize("n", [1, 3])
@@ -181,8 +180,7 @@ def test_a_centralised_policy_moves_a_group_as_one_vector():
     assert torch.equal(torch.stack(base.given), chunks.unflatten(-1, (3, 2)))
     renamed = RenameTransform([("agents", "observation")], ["observation"])
     env = TransformedEnv(Agents(), Compose(renamed, moved.clone(), *policy_transforms(policy)))
-    with raises(ValueError, "12", "3, 4", "FlattenObservation"):
-        env.rollout(1, policy)
+    refuses(lambda: env.rollout(1, policy), ValueError, "12", "3, 4", "FlattenObservation")
 
 
 @pytest.mark.parametrize("inside", [False, True])

@@ -6,7 +6,7 @@ import torch
 from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.errors import raises
+from tests.errors import refuses
 from tests.toy_env import CountingEnv
 from warmprior import ObservationStack
 
@@ -29,10 +29,8 @@ def test_rows_that_reset_or_rest_alone():
 
 
 def test_errors():
-    with raises(ValueError, "steps", 0):
-        ObservationStack(0)
+    refuses(lambda: ObservationStack(0), ValueError, "steps", 0)
     env = TransformedEnv(CountingEnv(9), ObservationStack(2))
     data = env.rand_action(env.reset())
     del data["observation"]
-    with raises(KeyError, "reset"):
-        env.step(data)
+    refuses(lambda: env.step(data), KeyError, "reset")

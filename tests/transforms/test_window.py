@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior import (
     ActionWindow,
     GaussianPrior,
@@ -211,8 +211,7 @@ def test_data_that_cannot_be():
     ):
         with raises(error, fact):
             ActionWindow(wrong, 2)
-    with raises(ValueError, "order"):
-        ActionWindow(pieces, 2)
+    refuses(lambda: ActionWindow(pieces, 2), ValueError, "order")
 
 
 @pytest.mark.parametrize("bad", [0, 777, 1999])
@@ -229,8 +228,7 @@ def test_options_that_cannot_be():
     for wrong in (-0.1, 1.1, float("nan"), True, "abc"):
         with raises(ValueError, "probability"):
             WithheldHistory(wrong)
-    with raises(KeyError, "ActionWindow"):
-        WithheldHistory(0.5)(TensorDict({}, [3]))
+    refuses(lambda: WithheldHistory(0.5)(TensorDict({}, [3])), KeyError, "ActionWindow")
     for name in ("observation_steps", "chunk_length", "prediction_length", "history_length"):
         value = int(name in ("prediction_length", "history_length"))  # less than the chunk
         with raises(ValueError, name, value):

@@ -6,7 +6,7 @@ pytest.importorskip("huggingface_hub")
 
 from lab.demonstrations.downloads import REPOSITORIES, download_robomimic
 from tests.data.synthetic import write_robomimic_file
-from tests.errors import raises
+from tests.errors import refuses
 from tests.io.hub_server import Loopback, etag, reachable
 
 FIRST = REPOSITORIES[0]
@@ -75,8 +75,7 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
             hub.sent[repository] = change(content)
         else:
             hub.put(repository, change(content), len(content) if announced else None)
-    with raises(OSError, fact, "force=True"):
-        download_robomimic("square", root=tmp_path)
+    refuses(lambda: download_robomimic("square", root=tmp_path), OSError, fact, "force=True")
     hub.sent = {}
     hub.put(FIRST, content)
     path = download_robomimic("square", root=tmp_path)
@@ -94,6 +93,5 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
     ],
 )
 def test_unknown_task_or_style_asks_nobody(hub, args, there):
-    with raises(ValueError, f"'{args[-1]}'", there):
-        download_robomimic(*args)
+    refuses(lambda: download_robomimic(*args), ValueError, f"'{args[-1]}'", there)
     assert not hub.requests

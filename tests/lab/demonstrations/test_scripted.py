@@ -23,7 +23,7 @@ from lab.demonstrations.scripted.episode import (
 )
 from lab.demonstrations.scripted.generate import generate_demonstrations
 from lab.demonstrations.scripted.motion import CLOSED, transfer
-from tests.errors import raises
+from tests.errors import raises, refuses
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import TASKS
 
@@ -140,8 +140,7 @@ def in_threads(count, state):
 )
 def test_bad_arguments(options, facts, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
-    with raises(ValueError, *facts):
-        generate_demonstrations(**{"task": "lift"} | options)
+    refuses(lambda: generate_demonstrations(**{"task": "lift"} | options), ValueError, *facts)
     assert not list(tmp_path.iterdir())
 
 

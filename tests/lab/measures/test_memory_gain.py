@@ -8,7 +8,7 @@ import torch
 from lab.measures.memory_gain import memory_gain
 from lab.methods.learned_sources import ForecastPrior, ForecastStart
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
-from tests.errors import raises
+from tests.errors import refuses
 from warmprior import (
     GaussianPrior,
     HistoryObservation,
@@ -115,30 +115,24 @@ def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, co
     assert found[300] == pytest.approx(spread / math.sqrt(spread**2 + kept), rel=5e-3)
 
 
-def test_a_learned_source_is_asked_with_the_shifted_history():
-    torch.manual_seed(0)
-    prior = ForecastPrior(H, widths=[D_A, 4, 1])
-    data = windows(prior)
-    field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
-    found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
-    expected = by_hand(lambda m, g: prior.distribution(m["history"], m["observation"]).sample(g), data)
-    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
-
-
-def test_it_measures_where_samplers_start():
+@pytest.mark.parametrize("learned", ["source", "start"])
+def test_what_is_learned_is_asked_with_the_shifted_history(learned):
     """STEP starts at a later time, from its forecast of what is remembered and less noise."""
     torch.manual_seed(0)
-    prior, start = GaussianPrior(H), ForecastStart(H, start_time=0.5, widths=[D_A, 4, 1])
+    if learned == "source":
+        prior, start = ForecastPrior(H, widths=[D_A, 4, 1]), None
+    else:
+        prior, start = GaussianPrior(H), ForecastStart(H, start_time=0.5, widths=[D_A, 4, 1])
     data = windows(prior)
-    stays = policy(lambda t, a, o: torch.zeros_like(a), start=start)
+    stays = policy(lambda t, a, o: torch.zeros_like(a), prior, start=start)  # executes where it starts
     found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]
 
     def act(moved, generator):
-        noise = torch.randn(len(moved), H, D_A, generator=generator)
-        return start(noise, moved["history"], moved["observation"])
+        history, observation = moved["history"], moved["observation"]
+        noise = prior.distribution(history, observation).sample(generator)
+        return noise if start is None else start(noise, history, observation)
 
-    expected = by_hand(act, data)
-    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
+    assert found == pytest.approx(by_hand(act, data), rel=1e-3) and abs(found) > 1e-4
 
 
 def test_a_guided_policy_is_measured_as_it_acts():
@@ -146,8 +140,7 @@ def test_a_guided_policy_is_measured_as_it_acts():
     prior = PastPrior(H, sigma=0.5)
     guided = WarmPriorActor(Field(lambda t, a, o: a.sin()), prior, nfe=4, guidance=RealTimeChunking())
     data = windows(prior, 20)
-    with raises(KeyError, "replace(guidance=None)"):
-        memory_gain(guided, data)
+    refuses(lambda: memory_gain(guided, data), KeyError, "replace(guidance=None)")
     data["rtc", "delay"] = torch.ones(20, 1, dtype=torch.int64)
     found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
 

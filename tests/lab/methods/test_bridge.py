@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lab.methods.bridge import BridgeCoupling, BridgeInterpolant
-from tests.errors import raises
+from tests.errors import raises, refuses
 from tests.objectives.test_flow_matching import actor_for
 from warmprior import FlowMatchingLoss, GaussianPrior, OTCoupling
 
@@ -60,5 +60,4 @@ def test_the_loss_takes_the_path_of_the_coupling():
     assert loss.interpolant.config() == BridgeInterpolant(0.2).config()
     with raises(ValueError, "straight path"):
         FlowMatchingLoss(actor, coupling=BridgeCoupling(0.2), objective="l1")
-    with raises(ValueError, "sigma", "got 0.0"):
-        BridgeCoupling(0.0)
+    refuses(lambda: BridgeCoupling(0.0), ValueError, "sigma", "got 0.0")

@@ -4,7 +4,7 @@ import math
 import pytest
 
 from lab.reporting.rows import AGENT, PLAYED, read_rows
-from tests.errors import raises
+from tests.errors import raises, refuses
 
 ROW = {
     **{"task": "lift", "data": "ph", "prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0},
@@ -42,8 +42,7 @@ COUNTS = ("episodes", "successes", "success_rate", "seed")  # they hang together
 )
 def test_a_column_that_is_missing(tmp_path, name, needed):
     without = {key: value for key, value in ROW.items() if key != name}
-    with raises(ValueError, "results.jsonl, line 2", name):
-        read(tmp_path, OTHER, without, needed=needed)
+    refuses(lambda: read(tmp_path, OTHER, without, needed=needed), ValueError, "results.jsonl, line 2", name)
 
 
 @pytest.mark.parametrize(
@@ -57,8 +56,7 @@ def test_a_column_that_is_missing(tmp_path, name, needed):
     ],
 )
 def test_a_value_that_cannot_be(tmp_path, name, value):
-    with raises(ValueError, "results.jsonl, line 1", name):
-        read(tmp_path, ROW | {name: value})
+    refuses(lambda: read(tmp_path, ROW | {name: value}), ValueError, "results.jsonl, line 1", name)
 
 
 @pytest.mark.parametrize(
@@ -68,8 +66,7 @@ def test_a_value_that_cannot_be(tmp_path, name, value):
 def test_counts_that_contradict(tmp_path, name, value):
     row = ROW | {name: value}
     said = (f"{row['successes']} successes", f"{row['episodes']} episodes", f"rate of {row['success_rate']}")
-    with raises(ValueError, "results.jsonl, line 1", *said):
-        read(tmp_path, row)
+    refuses(lambda: read(tmp_path, row), ValueError, "results.jsonl, line 1", *said)
 
 
 def test_lines_that_cannot_be(tmp_path):
@@ -77,8 +74,7 @@ def test_lines_that_cannot_be(tmp_path):
     for again in (ROW, ROW | {"successes": 1, "success_rate": 0.25, "outcomes": "1000"}):
         with raises(ValueError, "results.jsonl, line 3", "line 1"):
             read(tmp_path, ROW, OTHER, again)
-    with raises(ValueError, "results.jsonl, line 1", "algorithm"):
-        read(tmp_path, ROW, needed=AGENT)
+    refuses(lambda: read(tmp_path, ROW, needed=AGENT), ValueError, "results.jsonl, line 1", "algorithm")
     for line in ("[1]", "{", '"text"', "1e400", "[" * 100_000):
         with raises(ValueError, "results.jsonl, line 2"):
             read(tmp_path, ROW, line)
