@@ -114,9 +114,7 @@ class Run:
     """Options of the computation, and of what it writes."""
 
     out: Path | None = None  # output folder (default: a numbered folder under runs/)
-    resume: bool = (
-        False  # continue the run in --out, with its options; without --out the latest numbered folder
-    )
+    resume: bool = False  # continue the run in --out, or the latest numbered folder, with its options
     envs: int | None = None  # worker processes, which change no result (default: one per core)
     device: str = "cpu"  # device of networks and data, such as cuda; under torchrun each process has its own
     videos: bool = True  # save a filmstrip and a video of one episode per method
