@@ -39,6 +39,7 @@ FIGURES: dict[str, dict[str, str]] = {
         "default_actor_over_network": "<= 1.5",
         "exported_over_passes": "<= 0.35",
     },
+    "learning": {"learning_over_environments": ">= 0.4"},
     "environments": {
         "env_over_robosuite": ">= 2",
         "chunk_step_overhead": "<= 0.12 with all",
