@@ -21,7 +21,7 @@ def test_a_state_of_something_else_is_refused(tmp_path):
         "clip": {"actor": make_actor().replace(clip=0.5)},
         "start": {"actor": make_actor().replace(start=Halfway())},
         "environment": {"actor": make_actor().replace(environment={"env_name": "Other"})},
-        "evaluation_seed": {"collection": {"evaluation_seed": 7}},
+        "evaluation_seed": {"running": {"evaluation_seed": 7}},
     }.items():
         with raises(ValueError, part):
             make_training(tmp_path, **{"environment_steps": 30, **options})

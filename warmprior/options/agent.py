@@ -29,8 +29,8 @@ class PriorSpaceConfig:
         warmup_steps: control steps before any update, with residuals drawn from the prior and clipped to the
             box.
         delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
-        residual_length: the number ``R`` of residuals per chunk, each held for ``P / R`` actions; ``None``
-            for one per action.
+        residual_length: the number ``R`` of residuals per chunk, each held for ``P / R`` actions; by default
+            one per action.
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.

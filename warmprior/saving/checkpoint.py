@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -115,9 +116,8 @@ def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None
 DIGESTS = {
     "data": "the demonstrations, or what is read of them, differ",
     "policy": "the policy differs",
-    "buffers": "what was computed from the demonstrations differs",
 }
-"""What the digests of a configuration stand for; the last one mostly follows from other differences."""
+"""What the digests of a configuration stand for."""
 
 
 def differences(before: Any, now: Any) -> str:
@@ -125,29 +125,40 @@ def differences(before: Any, now: Any) -> str:
 
     Examples:
         >>> from warmprior.saving.checkpoint import differences
-        >>> before = {"prior": {"name": "past", "sigma": 0.5}, "device": "cpu", "data": "fd6a7b78"}
-        >>> differences(before, before | {"prior": {"name": "past", "sigma": 0.3}, "data": "4b6c497c"})
+        >>> before = {"prior": {"name": "past", "sigma": 0.5}, "data": "fd6a7b7812d94c3f"}
+        >>> differences(before, {"prior": {"name": "past", "sigma": 0.3}, "data": "4b6c497c00a1b2c3"})
         'sigma was 0.5 and is 0.3; the demonstrations, or what is read of them, differ'
         >>> differences(before, before | {"prior": {"name": "gaussian"}})
         'prior was past and is gaussian'
     """
-    found = {
-        name: DIGESTS[name] if name in DIGESTS and isinstance(old, str) else f"{name} was {old} and is {new}"
-        for name, old, new in _leaves("", before, now)
-    }
-    return "; ".join(text for name, text in found.items() if name != "buffers" or len(found) == 1)
+    found = {path: _in_words(path, old, new) for path, old, new in _leaves((), before, now)}
+    # Untrained values mostly follow from other differences.
+    return "; ".join(text for path, text in found.items() if path[-1] != "buffers" or len(found) == 1)
 
 
-def _leaves(name: str, before: Any, now: Any) -> Iterator[tuple[str, Any, Any]]:
+def _in_words(path: tuple[str, ...], old: Any, new: Any) -> str:
+    part = " of ".join(reversed(path[:-1]))
+    if not _is_digest(old) or not _is_digest(new):
+        return f"{path[-1]} was {old} and is {new}"
+    if path[-1] == "buffers":
+        return f"the untrained values of {part} differ"
+    return DIGESTS.get(path[-1], f"the {path[-1]} of {part} differs")
+
+
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and bool(re.fullmatch("[0-9a-f]{16,}", value))
+
+
+def _leaves(path: tuple[str, ...], before: Any, now: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
     """Yield the options that differ; objects of two classes differ by the name of their class alone."""
     are_parts = isinstance(before, dict) and isinstance(now, dict)
     if are_parts and before.get("name") == now.get("name"):
         for key in {**before, **now}:
             if before.get(key) != now.get(key):
-                yield from _leaves(key, before.get(key), now.get(key))
+                yield from _leaves((*path, key), before.get(key), now.get(key))
     else:
         old, new = (each.get("name", each) if isinstance(each, dict) else each for each in (before, now))
-        yield name, old, new
+        yield path, old, new
 
 
 def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
