@@ -262,7 +262,10 @@ def improve(
     options: Any = {"num_envs": num_envs, "config": config, "compile": compile, "episodes": episodes}
     result = improve_policy(actor, place, **options)
     save_policy(result.policy, place / "policy")
-    words = "no agent was better, so the policy is as it was"
+    words = (
+        "no agent was better, so the policy is as it was; residuals move its actions, which are between -1 "
+        f"and 1, by {result.reach:.2f}"
+    )
     if result.policy.start is not actor.start:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
     print(f"{words}\nto play it: {command_of('evaluate', place / 'policy')}")

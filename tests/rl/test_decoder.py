@@ -25,6 +25,7 @@ from warmprior import (
     WarmPriorActor,
     make_prior_space_actor,
 )
+from warmprior.rl import residual_reach
 
 H, D_A, D_O, TO = 3, ACTION_DIM, 5, 2
 make_actor = partial(mlp_actor, observation_dim=D_O, hidden_dim=16)
@@ -74,6 +75,29 @@ def test_residuals_are_held(residuals):
     assert networks(data)["prior", "delta"].shape == drawn.shape == (5, residuals, D_A)
     with raises(ValueError, "residual_length (3)", "(4)"):
         PriorDecoder(actor, delta=0.5, residual_length=3)
+
+
+class Slope(torch.nn.Module):
+    """The velocity ``k * a``, so one step decodes ``(1 + k) * a_0``."""
+
+    def __init__(self, slope):
+        super().__init__()
+        self.slope = slope
+
+    def forward(self, t, a, observation):
+        return self.slope * a
+
+
+@pytest.mark.parametrize("residuals", [1, 3])
+def test_the_reach_of_a_linear_field(residuals):
+    """Uniform residuals in the box have a standard deviation of ``delta / sqrt(3)``."""
+    decoder = PriorDecoder(make_actor(PastPrior(3), nfe=1), delta=0.6, residual_length=residuals)
+    decoder.ode.network = Slope(-0.75)
+    generator = torch.Generator().manual_seed(0)
+    found = residual_reach(decoder, batch(PastPrior(3), 400), draws=50, generator=generator)
+    assert found == pytest.approx(0.25 * 0.6 / 3**0.5, rel=0.01)
+    with raises(ValueError, "draws"):
+        residual_reach(decoder, batch(PastPrior(3), 4), draws=1)
 
 
 @pytest.mark.parametrize("network", ["mlp", "transformer"])

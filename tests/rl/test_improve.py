@@ -88,7 +88,11 @@ def test_a_policy_is_improved_compared_and_saved(tmp_path):
         assert sum(episode.success for episode in played) == solved
     env.close()
     again = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
-    assert again.curve == result.curve and (again.before, again.after) == (result.before, result.after)
+    assert (
+        again.curve == result.curve
+        and again.reach == result.reach > 0
+        and (again.before, again.after) == (result.before, result.after)
+    )
 
 
 @pytest.mark.parametrize("confirmed", [(1, 2), (2, 2), (2, 1)])
@@ -107,6 +111,7 @@ def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monk
     lucky = improved_policy(actor, make_training(tmp_path / "other", actor=actor).agent.network, nfe=2)
     monkeypatch.setattr(improve.PriorSpaceTraining, "run", lambda self: [])
     monkeypatch.setattr(improve.PriorSpaceTraining, "policy", lambda self: lucky)
+    monkeypatch.setattr(improve.PriorSpaceTraining, "reach", lambda self: 0.1)
     transforms = partial(policy_transforms, actor.prior, observation_steps=1)
     options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
     result = improve_policy(actor, tmp_path, config=make_config(environment_steps=60), episodes=4, **options)

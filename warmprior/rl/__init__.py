@@ -2,7 +2,7 @@
 
 from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor, has_anchor
-from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler
+from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler, residual_reach
 from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.improve import Improvement, improve_policy
 from warmprior.rl.improved import AgentStart, improved_policy
@@ -25,4 +25,5 @@ __all__ = [
     "improved_policy",
     "make_prior_space_actor",
     "make_prior_space_critic",
+    "residual_reach",
 ]

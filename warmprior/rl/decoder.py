@@ -294,3 +294,46 @@ class ResidualSampler(Drawing, TensorDictModuleBase):
         if self.distribution == "clipped":
             delta = delta.clamp(-self.delta, self.delta)
         return tensordict.set(self.out_keys[0], delta)
+
+
+def residual_reach(
+    decoder: PriorDecoder,
+    states: TensorDictBase,
+    *,
+    draws: int = 16,
+    generator: torch.Generator | None = None,
+) -> float:
+    """Return how far the agent's box moves chunks, in units of the normalised actions.
+
+    It is the standard deviation of decoded actions over residuals from the whole box, at a fixed observation
+    and anchor, as the root mean square over states, positions and dimensions. Near 0 an agent has nothing to
+    choose from: demonstrations that are alike teach a policy to ignore where its flow starts, most of all at
+    one network evaluation.
+
+    Args:
+        decoder: the frozen policy and its box.
+        states: the observations and anchors, ``[N]``, such as those of a replay buffer.
+        draws: residuals per state, at least 2.
+        generator: source of randomness; PyTorch's global one by default.
+
+    Raises:
+        KeyError: if the states lack a key.
+        ValueError: if ``draws`` is less than 2.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
+        >>> from warmprior.rl import residual_reach
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1), delta=0.5)
+        >>> states = TensorDict({"observation": torch.zeros(100, 2, 3),
+        ...                      "prior": {"anchor": torch.zeros(100, 4, 2)}}, [100])
+        >>> wide = PriorDecoder(WarmPriorActor(decoder.network, PastPrior(4), nfe=1), delta=1.0)
+        >>> residual_reach(decoder, states) < residual_reach(wide, states)
+        True
+    """
+    check_whole_numbers(2, draws=draws)
+    box = ResidualSampler(decoder, distribution="uniform", generator=generator)
+    states = states.select(decoder.observation_key, keys.ANCHOR)
+    chunks = [decoder(box(states.copy()))[keys.CHUNK] for _ in range(draws)]
+    return float(torch.stack(chunks).var(0).mean().sqrt())

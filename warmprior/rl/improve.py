@@ -48,12 +48,13 @@ class Improvement:
         before: solved episodes of the frozen policy.
         after: solved episodes of ``policy``.
         episodes: number of episodes of each, from the same starts, by which nothing was chosen.
+        reach: how far the agent's box moves chunks, see :func:`~warmprior.rl.residual_reach`.
         curve: the evaluations by which the policy was chosen, see :meth:`PriorSpaceTraining.run`.
 
     Examples:
         >>> from warmprior import Improvement, PastPrior, VelocityMLP, WarmPriorActor
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
-        >>> result = Improvement(actor, before=40, after=90, episodes=100, curve=[])
+        >>> result = Improvement(actor, before=40, after=90, episodes=100, reach=0.1, curve=[])
         >>> result.after > result.before
         True
     """
@@ -62,6 +63,7 @@ class Improvement:
     before: int
     after: int
     episodes: int
+    reach: float
     curve: list[dict[str, Any]]
 
 
@@ -180,4 +182,4 @@ def improve_policy(
         if improved is not frozen:
             after = solved(improved, EVALUATION_SEED, "after")
         env.close(raise_if_closed=False)
-    return Improvement(improved, before, after, episodes, curve)
+    return Improvement(improved, before, after, episodes, training.reach(), curve)

@@ -29,6 +29,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.agent import PriorSpaceAgent, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
+from warmprior.rl.decoder import residual_reach
 from warmprior.rl.improved import improved_policy
 from warmprior.saving.checkpoint import (
     RunState,
@@ -249,6 +250,11 @@ class PriorSpaceTraining:
                     self.agent.state()  # Raises if the agent's state is not finite.
                     self._evaluate(evaluation_env, "greedy", self.agent.policy)
                     self._save()
+
+    def reach(self, states: int = 256) -> float:
+        """Return how far the box moves chunks at the first states, see :func:`residual_reach`."""
+        generator = torch.Generator(self.device).manual_seed(self.config.seed)
+        return residual_reach(self.decoder, self.buffer[:states], generator=generator)
 
     @contextmanager
     def _environment(self, seed: int) -> Iterator[EnvBase]:
