@@ -111,20 +111,20 @@ def sentences() -> dict[str, list[str]]:
             f"{long_rates[0]}% and {long_rates[1]}% at nine, three and one "
             f"({', '.join(c.chance for c in long)})",
             f"each source at its own better length, {better_rates[0]}% and {better_rates[1]}%",
-            f"source, the decoder of a CVAE, solves {rates[CVAE, 9]}% ({learned[9].chance})",
-            f"the regression MIP {rates['mip', 2]}% in two evaluations ({mip.chance})",
-            f"source with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% ({absolute.chance})",
+            f"decoder of a CVAE, solves {rates[CVAE, 9]}% at nine evaluations ({learned[9].chance})",
+            f"MIP, a regression of the benchmarks, {rates['mip', 2]}% at two ({mip.chance})",
+            f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at nine ({absolute.chance})",
             f"{paper[PAST]} points more with WP-Past at nine, three and one, "
             f"{paper[PREVIEW]} with WP-Preview",
         ],
         "which_source.md": [
-            f"WP-Past and WP-Preview succeed {span(few)} points more often at one step on average, within "
+            f"WP-Past and WP-Preview score {span(few)} points higher at one step on average, within "
             f"chance (WP-Past with 25: {past_once.chance})",
-            f"solve {fifty[0]} and {fifty[1]}%, and the Gaussian source {fifty[2]}",
-            f"WP-Past and WP-Preview succeed {span(short)} points less often at one step",
+            f"WP-Past solves {fifty[0]}%, correlated noise {fifty[1]}%, and the Gaussian source {fifty[2]}%",
+            f"WP-Past and WP-Preview score {span(short)} points lower at one step",
             f"the Gaussian source then solves {transport[2]}% at one step (up from {transport[0]}), "
             f"and WP-Past {transport[3]}% (up from {transport[1]})",
-            f"at one step sources solve {span(fewer)}% fewer episodes than at nine, on average "
+            f"one step loses {span(fewer)}% of the episodes that nine solve, on average "
             f"(leaderboard); with an L1 loss {span(fewer_l1)}%",
         ],
         "leaderboard.md": [

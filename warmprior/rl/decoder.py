@@ -324,7 +324,7 @@ def residual_reach(
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
-        >>> from warmprior.rl import residual_reach
+        >>> from warmprior import residual_reach
         >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1), delta=0.5)
         >>> states = TensorDict({"observation": torch.zeros(100, 2, 3),
         ...                      "prior": {"anchor": torch.zeros(100, 4, 2)}}, [100])
