@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
 
@@ -237,7 +238,8 @@ class Demonstrations:
             actions: pose deltas as recorded; or ``"absolute"``, the poses that they target, of 10 numbers per
                 arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
                 also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
-            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk.
+            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk, and for images the cache, in
+                which the next reader finds them (see :func:`~warmprior.data.frames.cached_images`).
             scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
 
         Raises:
@@ -249,4 +251,7 @@ class Demonstrations:
         """
         index = self.index(observations, images, poses=actions == "absolute")
         with self.reader(index) as reader:
-            return read_steps(index, reader, actions=actions, storage=storage, scratch_dir=scratch_dir)
+            contents = partial(self.contents, index)
+            return read_steps(
+                index, reader, contents, actions=actions, storage=storage, scratch_dir=scratch_dir
+            )
