@@ -17,7 +17,7 @@ from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
-from warmprior.modules.recording import AS_RECORDED, Recording
+from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 from warmprior.modules.trend import vector_of
 from warmprior.options.data import IMAGE_SIZE, Resize
 
@@ -110,14 +110,17 @@ class Demonstrations:
 
     def recording(self, index: DatasetIndex, actions: str | None = None) -> Recording:
         """Return what is read of the demonstrations, what is left out, and what ``actions`` are, in words."""
-        side, shapes = index.image_size, zip(index.image_keys, index.image_shapes, strict=True)
+        sized, shapes = (
+            (index.image_size, index.resize),
+            dict(zip(index.image_keys, index.image_shapes, strict=True)),
+        )
         return Recording(
             self.name,
             len(index.demos),
             sum(index.lengths),
             actions or f"[{index.action_dim}]{AS_RECORDED}",
             dict(zip(index.observation_keys, index.observation_dims, strict=True)),
-            {key: f"{height} x {width}, seen at {side} x {side}" for key, (height, width) in shapes},
+            {key: image_words(shape, *sized) for key, shape in shapes.items()},
             {key: index.images[key] for key in index.image_keys if key in index.images},
             index.left_out,
             index.rate,
