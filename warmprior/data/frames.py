@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,9 +22,6 @@ from warmprior.modules.resize import resized
 
 FRAMES_VERSION = 1
 """The version of reading here; it is raised whenever the same contents give other images."""
-
-DECODERS = ("torch", "torchcodec", "av", "pillow", "lerobot", "minari")
-"""The packages that decode and resize images, whose other versions may give other values."""
 
 CACHE_BYTES = 50 * 2**30
 """The size from which on images that were not used lately leave the cache."""
@@ -58,10 +55,10 @@ def read_images(index: DatasetIndex, reader: DemonstrationReader, key: str, out:
 def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, contents: str) -> Tensor:
     """Return the images of a camera as a memory map of the cache, uint8 ``[N, 3, size, size]``.
 
-    The first call for the same contents, demonstrations, size, way of resizing and versions of the decoders
-    reads them, while other processes that ask for these wait. Images of every format go this way, also those
-    that need no decoding: each demonstration of a file has its own array, channels last, so a copy is needed
-    anyway, and here all runs share it.
+    The first call for the same contents, demonstrations, size, way of resizing and versions of decoders
+    and PyTorch reads them, while other processes that ask for these wait. Images of every format go this way,
+    also those that need no decoding: each demonstration of a file has its own array, channels last, so a copy
+    is needed anyway, and here all runs share it.
 
     The cache is the folder ``images`` in ``$WARMPRIOR_CACHE``, or in ``~/.cache/warmprior`` if that is not
     set. When it exceeds 50 GiB after images were added, those used longest ago leave it, but none of the last
@@ -82,7 +79,8 @@ def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, co
     """
     shape, feature = image_shape(index), index.images.get(key, key)
     options = index.demos, index.lengths, feature, index.image_size, index.resize
-    identity = digest_of(FRAMES_VERSION, [*map(_version, DECODERS)], contents, *options)
+    versions = [(package, version(package)) for package in ("torch", *reader.decoders(key))]
+    identity = digest_of(FRAMES_VERSION, versions, contents, *options)
     path = cache_folder() / "images" / f"{identity}.bytes"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,13 +97,6 @@ def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, co
             f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
             f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
         ) from error
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _write(path: Path, index: DatasetIndex, reader: DemonstrationReader, key: str) -> None:
