@@ -111,6 +111,13 @@ def quick_simulators():
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory):
+    """No test finds what an earlier run left in the user's cache, or leaves something there."""
+    with patch.dict(os.environ, WARMPRIOR_CACHE=str(tmp_path_factory.mktemp("cache"))):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def renders_apart():
     """No test leaves behind a process of which forked workers could not render."""

@@ -6,7 +6,7 @@ import importlib
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,8 +18,8 @@ from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import Algorithm
-from warmprior.options.data import Actions, Resizing
 from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.train_command import Data, Evaluation, Run, Source
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
@@ -274,80 +274,6 @@ def improve(
 def command_of(command: str, folder: Path) -> str:
     """Return the line of a shell that runs a command on a policy."""
     return f"python -m warmprior {command} {shlex.quote(str(folder))}"
-
-
-@dataclass(frozen=True)
-class Data(Resizing):
-    """The options of the demonstrations, and of the task that is learnt from them.
-
-    Attributes:
-        observations: observations of the policy, in this order; by default the task's
-        images: images of the policy, in addition to the robot's state, such as agentview_image
-        demonstrations: number of demonstrations, from the first on; by default all
-        mask: mask of the file, such as train, whose demonstrations to use; by default all
-        joints: observation of the joint positions that absolute actions target; by default observation.state
-            of a LeRobotDataset with the names of the actions, if the numbers are near; "" for none
-        actions: actions of the policy: as recorded, or the absolute poses that robosuite's deltas target
-        task: task of robosuite, for a LeRobotDataset that does not describe its environment
-        style: style of the demonstrations, which decides robosuite's time limit; by default ph, and human
-            outside robosuite
-        horizon: control steps per episode; by default the environment's own, or robosuite's for the style
-        fast_rendering: render robosuite's images without reflections, shadows and smooth edges
-    """
-
-    observations: tuple[str, ...] | None = None
-    images: tuple[str, ...] = ()
-    demonstrations: int | None = None
-    mask: str | None = None
-    joints: str | None = None
-    actions: Actions = "delta"
-    task: str | None = None
-    style: str | None = None
-    horizon: int | None = None
-    fast_rendering: bool = False
-
-
-@dataclass(frozen=True)
-class Source:
-    """The options of the source.
-
-    Attributes:
-        prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
-            in past,sigma=0.3; by default past,correlation=0.5, or gaussian if actions are absolute targets
-        chunk: chunk length H
-    """
-
-    prior: str | None = None
-    chunk: int = 8
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The options of the evaluation.
-
-    Attributes:
-        nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 with --times start
-        held_out: number of last demonstrations to leave out for measuring the error of actions; by default
-            a tenth, or one of few, if no environment is known, else none
-    """
-
-    nfe: int | None = None
-    held_out: int | None = None
-
-
-@dataclass(frozen=True)
-class Run:
-    """The options of the computation, and of what it writes.
-
-    Attributes:
-        out: folder of training runs, in which an interrupted one continues
-        device: device of the network, such as cuda
-        compile: train with torch.compile, which needs a C++ compiler
-    """
-
-    out: Path = Path("policies")
-    device: str = "cpu"
-    compile: bool = False
 
 
 def train(

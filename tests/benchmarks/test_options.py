@@ -13,6 +13,7 @@ import robomimic
 import sigma
 from mimicgen_tasks import FEW
 
+from lab.demonstrations.data_options import DataOptions
 from lab.demonstrations.scripted import generate
 from lab.options.command_line import parse, started
 from lab.options.options import Options
@@ -172,6 +173,16 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
             assert read("--preset", name, *argv).data.first("ph") is None
             # Also where it is the preset's own number.
             assert read("--preset", name, *argv, "--demonstrations", ph).data.first("ph") == ph
+
+
+def test_naming_images_asks_for_policies_that_see_them():
+    for preset in ("quick", "cpu", "paper", "much-ado"):
+        named = ["--preset", preset, "--images", "agentview_image"]
+        options = read(*named)
+        assert options == read(*named, "--obs", "image") and options.data.sees_images
+        assert options.name.endswith("-image") and options.data.images == ("agentview_image",)
+        assert options.data.image_size == {"quick": 48, "cpu": 48}.get(preset, 84)
+    assert DataOptions(images=("front",)).sees_images and not DataOptions().sees_images
 
 
 def test_tables_name_what_is_not_the_papers():

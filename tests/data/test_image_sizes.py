@@ -23,6 +23,9 @@ from warmprior import PastPrior, window_replay_buffer
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, Demonstrations, demonstrations_of, open_demonstrations
 from warmprior.data.convert import quietly
+from warmprior.data.formats.hdf5 import RobomimicReader
+from warmprior.data.formats.lerobot import LeRobotReader
+from warmprior.data.formats.minari import MinariReader
 from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.deploy import AsyncExecutor
 from warmprior.deploy.observation import encoder_in
@@ -139,6 +142,31 @@ def test_every_format_gives_the_same_windows(places, episodes, options):
     assert (windows[0] == windows[1]).all() and (windows[0] == windows[2]).all()
 
 
+def test_a_second_training_decodes_nothing(places, episodes, monkeypatch, tmp_path):
+    """Other options are decoded anew, in every format."""
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
+    decoded = []
+    for reader in (LeRobotReader, RobomimicReader, MinariReader):
+
+        def images(self, demo, key, read=reader.images):
+            decoded.append(demo)
+            return read(self, demo, key)
+
+        monkeypatch.setattr(reader, "images", images)
+    for options, shown in (({}, ()), ({"image_size": 40, "resize": "pad", "demos": 2}, (40, "pad"))):
+        wanted = expected(episodes, *shown)
+        for place, (joints, names) in places.items():
+            for again in (False, True):
+                decoded.clear()
+                demonstrations = open_demonstrations(place, **options)
+                data = demonstrations.steps([joints], names, storage="memmap")
+                assert len(decoded) == (0 if again else len(CAMERAS) * options.get("demos", 3))
+                keys = demonstrations.index([joints], names).image_keys
+                for key, images in zip(keys, wanted.values(), strict=True):
+                    assert torch.equal(data["observation", key], images[: len(data)])
+    assert len(list(tmp_path.rglob("*.bytes"))) == len(places) * 2 * len(CAMERAS)
+
+
 def test_steps_in_memory_are_resized_alike(episodes):
     whole = {name: np.concatenate([episode[name] for episode in episodes]) for name in CAMERAS}
     frames = {name: torch.from_numpy(value).permute(0, 3, 1, 2) for name, value in whole.items()}
@@ -235,6 +263,9 @@ class Cameras(Demonstrations):
     @contextmanager
     def reader(self, index):
         yield Frames(self)
+
+    def contents(self, index):
+        return f"{self.count} frames of a seed"
 
 
 class Frames(DemonstrationReader):

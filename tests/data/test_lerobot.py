@@ -72,6 +72,18 @@ def test_images_are_decoded_as_lerobot_does(written):
     assert off.abs().mean() < 8  # a video is lossy
 
 
+def test_images_of_another_decoder_are_decoded_anew(written, tmp_path, monkeypatch):
+    """A video's decoder follows from what can be loaded, not only from versions; pictures have another."""
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
+    root, _ = written
+    keys = ["agentview_image", "robot0_eye_in_hand_image"]
+    for backend, files in (("pyav", 2), ("torchcodec", 3), ("pyav", 3)):
+        name = "lerobot.utils.import_utils.get_safe_default_video_backend"
+        monkeypatch.setattr(name, lambda backend=backend: backend)
+        LeRobotDemonstrations(root).steps(images=keys, storage="memmap")
+        assert len(list(tmp_path.rglob("*.bytes"))) == files
+
+
 def test_cameras_whose_names_end_alike_are_told_apart(tmp_path):
     images = [("rgb.head", "image"), ("mask.head", "image"), ("wrist", "image")]
     write_lerobot(tmp_path / "data", (2,), images=images)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.data.lerobot_parts import numbers, write_lerobot
-from tests.errors import raises, refuses
+from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
 from warmprior import (
@@ -120,6 +120,32 @@ def test_nan_of_an_episode_that_is_left_out_is_in_the_statistics(found, tmp_path
     (root / "meta/stats.json").write_text(json.dumps(stats))
     with raises(ValueError, "meta/stats.json", "action: max", "delete_episodes", "recompute_stats"):
         dataset_policy(found, root, [0])
+
+
+def test_a_training_says_what_it_uses_of_the_dataset(found, tmp_path, caplog):
+    """Cameras with the options of their size; what is left out, and of which episodes."""
+    images = [("front", "image"), ("side", "image")]
+    write_lerobot(tmp_path / "data", (5, 6, 7), images=images)
+    caplog.set_level("INFO")
+    sizes = {"encoder": "small", "image_size": 24, "crop_size": 16}
+    policy, dataset = dataset_policy(found, tmp_path / "data", [0, 2], resize="pad", **sizes)
+    height, width = dataset.meta.features["observation.images.front"]["shape"][:2]
+    shown = f"observation.images.front, {height} x {width}, seen at 24 x 24 (pad)"
+    assert not missing(
+        caplog.messages[-1], shown, "2 demonstrations, 12 steps", "nothing", "20 control steps"
+    )
+    seen = policy.config.input_features
+    seen = {name: entry for name, entry in seen.items() if name != "observation.images.side"}
+    dataset_policy(found, tmp_path / "data", input_features=seen, **sizes)
+    assert "left out      observation.images.side (--policy.input_features)" in caplog.messages[-1]
+    assert "(squeeze)" in caplog.messages[-1] and "3 demonstrations, 18 steps" in caplog.messages[-1]
+    blind = {name: entry for name, entry in seen.items() if "images" not in name}
+    dataset_policy(found, tmp_path / "data", input_features=blind)
+    for options in ({"image_size": 24}, {"resize": "pad"}, {"crop_size": 8}, {"encoder": "small"}):
+        with raises(ValueError, f"--policy.{next(iter(options))} would change nothing"):
+            dataset_policy(found, tmp_path / "data", input_features=blind, **options)
+    with raises(ValueError, "--policy.resize", "squeeze", "pad", "crop"):
+        dataset_policy(found, tmp_path / "data", resize="crop")
 
 
 def test_features_of_width_1(found, tmp_path):

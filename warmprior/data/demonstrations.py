@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_args
 
@@ -16,7 +17,7 @@ from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
-from warmprior.modules.recording import AS_RECORDED, Recording
+from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 from warmprior.modules.trend import vector_of
 from warmprior.options.data import IMAGE_SIZE, Resize
 
@@ -109,14 +110,17 @@ class Demonstrations:
 
     def recording(self, index: DatasetIndex, actions: str | None = None) -> Recording:
         """Return what is read of the demonstrations, what is left out, and what ``actions`` are, in words."""
-        side, shapes = index.image_size, zip(index.image_keys, index.image_shapes, strict=True)
+        sized, shapes = (
+            (index.image_size, index.resize),
+            dict(zip(index.image_keys, index.image_shapes, strict=True)),
+        )
         return Recording(
             self.name,
             len(index.demos),
             sum(index.lengths),
             actions or f"[{index.action_dim}]{AS_RECORDED}",
             dict(zip(index.observation_keys, index.observation_dims, strict=True)),
-            {key: f"{height} x {width}, seen at {side} x {side}" for key, (height, width) in shapes},
+            {key: image_words(shape, *sized) for key, shape in shapes.items()},
             {key: index.images[key] for key in index.image_keys if key in index.images},
             index.left_out,
             index.rate,
@@ -237,7 +241,8 @@ class Demonstrations:
             actions: pose deltas as recorded; or ``"absolute"``, the poses that they target, of 10 numbers per
                 arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
                 also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
-            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk.
+            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk, and for images the cache, in
+                which the next reader finds them (see :func:`~warmprior.data.frames.cached_images`).
             scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
 
         Raises:
@@ -249,4 +254,7 @@ class Demonstrations:
         """
         index = self.index(observations, images, poses=actions == "absolute")
         with self.reader(index) as reader:
-            return read_steps(index, reader, actions=actions, storage=storage, scratch_dir=scratch_dir)
+            contents = partial(self.contents, index)
+            return read_steps(
+                index, reader, contents, actions=actions, storage=storage, scratch_dir=scratch_dir
+            )

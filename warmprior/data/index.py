@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -152,6 +152,10 @@ class DemonstrationReader(ABC):
     @abstractmethod
     def images(self, demo: str, key: str) -> Iterator[Tensor]:
         """Yield the images of a demo as they are stored, in blocks, uint8 ``[n, 3, h, w]``."""
+
+    def decoders(self, key: str) -> Sequence[str]:
+        """Return the packages of which another version may give other images; none by default."""
+        return ()
 
     @abstractmethod
     def name(self, demo: str, key: str) -> str:

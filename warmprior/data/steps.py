@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_choice
+from warmprior.data.frames import cached_images, image_shape, read_images, reserve
 from warmprior.data.index import (
     BLOCK,
     MISFIT,
@@ -31,9 +31,7 @@ from warmprior.data.index import (
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
 from warmprior.io.machine import available_memory
-from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
-from warmprior.modules.resize import resized
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
 Storage = Literal["memory", "memmap"]
@@ -45,18 +43,29 @@ StoredActions = Literal["delta", "absolute", "stored"]
 def read_steps(
     index: DatasetIndex,
     reader: DemonstrationReader,
+    contents: Callable[[], str],
     *,
     actions: StoredActions = "delta",
     storage: Storage = "memory",
     scratch_dir: str | Path | None = None,
 ) -> TensorDict:
-    """Return the values of demonstrations; see :meth:`Demonstrations.steps` for entries and options."""
+    """Return the values of demonstrations; see :meth:`Demonstrations.steps` for entries and options.
+
+    ``contents`` returns the digest of what the place holds.
+    """
     check_choice("storage", storage, get_args(Storage))
     check_choice("actions", actions, get_args(StoredActions))
     conventions = _conventions(index, actions == "absolute")
     action_dim = index.action_dim if conventions is None else 10 * len(conventions[1])
     data = _allocate(index, action_dim, storage, scratch_dir)
     _fill(index, data, reader, _actions(index, reader, conventions, actions))
+    if storage == "memory":
+        for key in index.image_keys:
+            read_images(index, reader, key, data[OBSERVATION, key])
+    elif index.image_keys:
+        digest, data = contents(), data.clone(False)  # a map in files of its own takes no others
+        for key in index.image_keys:
+            data[OBSERVATION, key] = cached_images(index, reader, key, digest)
     return data
 
 
@@ -113,10 +122,11 @@ def _allocate(
 ) -> TensorDict:
     steps = sum(index.lengths)
     vector = (torch.float32, (sum(index.observation_dims),))
-    image = (torch.uint8, (3, index.image_size, index.image_size))
+    image = (torch.uint8, image_shape(index)[1:])
+    allocated = index.image_keys if storage == "memory" else ()  # others are maps of the cache
     widths = {
         _vector_key(index): vector,
-        **{(OBSERVATION, key): image for key in index.image_keys},
+        **{(OBSERVATION, key): image for key in allocated},
         ACTION: (torch.float32, (action_dim,)),
         ("next", "reward"): (torch.float32, (1,)),
         **{("next", flag): (torch.bool, (1,)) for flag in ("done", "terminated", "truncated")},
@@ -146,7 +156,7 @@ def _allocate(
         for value in data.values(True, True):
             mapped.append(value.filename)
             Finalize(value.untyped_storage(), _release, (folder, mapped), exitpriority=0)
-            _reserve(value)
+            reserve(value)
     except OSError as error:
         raise OSError(
             f"{scratch_dir or 'the folder of temporary files'}: cannot store {needed / 1e9:.3g} GB for "
@@ -157,14 +167,6 @@ def _allocate(
 
 def _vector_key(index: DatasetIndex) -> NestedKey:
     return (OBSERVATION, STATE) if index.image_keys else OBSERVATION
-
-
-def _reserve(mapped: Any) -> None:
-    """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
-    if not hasattr(os, "posix_fallocate"):
-        return
-    with open(mapped.filename, "r+b") as file:
-        os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
 
 
 def _release(folder: str, mapped: list[str]) -> None:
@@ -259,24 +261,11 @@ def _fill(
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
-    # A bar only for images, which take long because they are unpacked one by one.
-    bar = progress_bar(f"read {index.path.name}" if index.image_keys else None, index.demos, unit="demo")
-    for episode, (demo, (start, stop)) in enumerate(zip(bar, pairwise(rows), strict=True)):
+    for episode, (demo, (start, stop)) in enumerate(zip(index.demos, pairwise(rows), strict=True)):
         for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
             reader.numbers(demo, f"obs/{key}", observation[start:stop, left:right])
         read_actions(demo, action[start:stop])
         reader.numbers(demo, "rewards", reward[start:stop])
-        for key in index.image_keys:
-            images, first = data[OBSERVATION, key], start
-            for block in reader.images(demo, key):
-                part = images[first : first + len(block)]
-                part.copy_(resized(block, (index.image_size,) * 2, index.resize)[: len(part)])
-                first += len(block)
-            if first != stop:
-                raise DatasetError(
-                    f"{index.path}: demo {demo} has {first - start} images {key} for {stop - start} steps: "
-                    "record it again or leave it out"
-                )
         data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)

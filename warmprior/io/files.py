@@ -62,6 +62,11 @@ def is_repository(name: str) -> bool:
     return bool(re.fullmatch(f"{part}/{part}", name))
 
 
+def cache_folder() -> Path:
+    """Return the folder of generated files: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
+    return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()
+
+
 def check_regular(path: Path) -> None:
     """Raise an error where there is no file, or something else: a pipe or a device may never answer."""
     if not path.exists():

@@ -12,6 +12,18 @@ AS_RECORDED = ", as recorded"
 """The end of the words for actions whose meaning is unknown."""
 
 
+def image_words(shape: Sequence[int], size: int, resize: str) -> str:
+    """Return what becomes of images of a height and width, given the options of their size.
+
+    Examples:
+        >>> from warmprior.modules.recording import image_words
+        >>> image_words((84, 84), 84, "squeeze"), image_words((480, 640), 84, "pad")
+        ('84 x 84', '480 x 640, seen at 84 x 84 (pad)')
+    """
+    words = " x ".join(map(str, shape))
+    return words if (*shape,) == (size, size) else f"{words}, seen at {size} x {size} ({resize})"
+
+
 @dataclass(frozen=True)
 class Recording:
     """A description of what a policy is trained on, which JSON can hold.

@@ -83,12 +83,12 @@ class DataOptions(Resizing):
         demonstrations: number of demonstrations to generate, or to take from a file, which is taken whole if
             none is given; two numbers for ph and mh
         actions: actions of the policies: deltas as recorded, or the absolute poses that they target
-        obs: observations of the policies: state of robot and objects, or state of the robot and images
+        obs: observations of the policies: state of robot and objects, or state of the robot and images, those
+            of the task's two cameras (four with two arms) if --images names no others
         observations: observations of the policies, in this order, of --dataset (default: the task's)
         joints: observation of the joint positions that absolute actions of --dataset target; "" for none
             (default: as python -m warmprior train recognises it)
-        images: images, such as agentview_image (default: those of the task's two cameras, or four with two
-            arms)
+        images: images for the policies to see, such as agentview_image
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster
 
     Examples:
@@ -139,17 +139,17 @@ class DataOptions(Resizing):
             raise ValueError("--mask is that of a file: add --download, or --dataset FILE")
         if self.dataset is None and (self.observations is not None or self.joints is not None):
             raise ValueError("--observations and --joints choose among those of --dataset: name one")
-        if self.obs == "image":
+        if self.sees_images:
             try:
                 require_rendering()
             except ImportError as error:
-                raise ValueError(f"--obs image needs the simulator's images: {error}") from error
+                raise ValueError(f"policies that see images need the simulator's: {error}") from error
             if self.actions == "absolute":
-                raise ValueError("--obs image goes with --actions delta, as in the paper")
+                raise ValueError("images go with --actions delta, as in the paper")
             if len(set(self.images)) < len(self.images):
                 raise ValueError(f"--images names one twice: {' '.join(self.images)}")
-        elif self.images or self.fast_rendering:
-            raise ValueError("--images and --fast-rendering belong to --obs image")
+        elif self.fast_rendering:
+            raise ValueError("--fast-rendering is that of images: add --images NAME or --obs image")
         if self.dataset is not None:
             if self.download:
                 raise ValueError("--dataset reads a file: leave out --download")
@@ -190,6 +190,11 @@ class DataOptions(Resizing):
             raise ValueError(f"this task takes one number of --demonstrations, got {self.demonstrations}")
 
     @property
+    def sees_images(self) -> bool:
+        """Return True if the policies see images: those that are named, or the task's."""
+        return bool(self.images) or self.obs == "image"
+
+    @property
     def generated(self) -> bool:
         """Return True if scripted experts generate the data."""
         return self.dataset is None and not self.download
@@ -212,11 +217,11 @@ def check_network(network: NetworkOptions, data: DataOptions) -> None:
     """Raise an error for options of images that do not fit, and for pretrained weights that are missing."""
     from warmprior.modules.encoder import imagenet_weights
 
-    if data.obs == "state":
+    if not data.sees_images:
         usual = without_images(network) == network or network.encoder == "resnet18"
         if not usual or (data.image_size, data.resize) != (None, "squeeze"):
             names = "--image-size, --resize, --crop-size, --share-encoder and --encoder"
-            raise ValueError(f"{names} belong to --obs image")
+            raise ValueError(f"{names} are those of images: add --images NAME or --obs image")
         return
     if data.image_size and network.crop_size and not 8 <= network.crop_size <= data.image_size:
         raise ValueError(

@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lab.io.files import cache_folder
 from lab.io.workers import available_cores, working
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
 from warmprior.data.images import StateRenderer, renderer_versions
 from warmprior.data.index import DatasetError, DatasetIndex
 from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
-from warmprior.io.files import check_writable, digest_of, exclusive, file_digest, write_atomic
+from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic
 from warmprior.io.machine import available_memory
 from warmprior.options.data import IMAGE_SIZE
 

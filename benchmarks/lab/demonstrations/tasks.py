@@ -41,7 +41,7 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
     )
     images: Sequence[str] = ()
     pictured = demonstrations
-    if options.obs == "image":
+    if options.sees_images:
         index = demonstrations.index()
         images = options.images or images_of(index.task.cameras if index.task else index.cameras)
         if not images:

@@ -1,9 +1,8 @@
-"""Files of results, the cache of generated files, and errors of runs that failed in part."""
+"""Files of results, and errors of runs that failed in part."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +32,3 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
                 f"{path}, line {number} is damaged ({error}): remove that line, and continue with --resume"
             ) from error
     return records
-
-
-def cache_folder() -> Path:
-    """Return the folder of generated files: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
-    return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

@@ -170,7 +170,7 @@ class Options:
             tasks = (open_demonstrations(file).title,)
         tasks = tasks or ("square",)
         space = [] if self.data.actions == "delta" else [self.data.actions]
-        observations = [] if self.data.obs == "state" else [self.data.obs]
+        observations = ["image"] if self.data.sees_images else []
         names = [task.replace(":", "-") for task in tasks]
         return "-".join([*names, *self.data.style, *space, *observations])
 
@@ -216,9 +216,9 @@ class Options:
                 )
             if self.training.objective == "l1" and not method.is_straight:
                 raise ValueError(f"--objective l1 needs a straight path: leave out {method.name}")
-            if self.data.obs == "image" and method.needs_vector:
+            if self.data.sees_images and method.needs_vector:
                 raise ValueError(
-                    f"{method.name} reads observations that are one vector: leave it out with --obs image"
+                    f"{method.name} reads observations that are one vector: leave it out with images"
                 )
             try:
                 method.recipe(self.training)

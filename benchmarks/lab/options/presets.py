@@ -70,9 +70,9 @@ def adapted[O: Options](preset: O, typed: Options) -> O:
     """
     if typed.data.dataset is not None and all(map(is_simulated, preset.data.task)):
         preset = with_parts(preset, data={"task": ()})
-    if "image" not in (typed.data.obs, preset.data.obs):
+    if not (typed.data.sees_images or preset.data.sees_images):
         return preset
-    if preset.data.obs == "state":
+    if not preset.data.sees_images:
         changes = {part: dict(values) for part, values in IMAGES[typed.preset].items()}
         changes["data"] = {**changes.get("data", {}), "obs": "image"}
         if typed.preset == "quick" and preset.data.task == PRESETS["quick"].data.task:

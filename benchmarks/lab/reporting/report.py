@@ -392,7 +392,7 @@ NO_RECIPE |= {"seed", "seeds", "episodes", "nfe", "save_every", "log_every"}
 
 def unlike(options: Options, paper: Options) -> list[str]:
     """Return a note on the options in which the recipe differs from the paper's, if any."""
-    if options.data.obs == "image" and paper.data.obs == "state":
+    if options.data.sees_images and not paper.data.sees_images:
         paper = with_parts(with_parts(paper, **IMAGES["paper"]), data={"obs": "image"})
 
     def recipe(one: Options) -> dict[str, Any]:

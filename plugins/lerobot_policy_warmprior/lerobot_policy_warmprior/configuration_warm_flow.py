@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
@@ -14,11 +14,11 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_policy_warmprior.configuration_warm_vla import DEFAULT_PRIOR, OWN_PRIORS
 from warmprior import Prior
-from warmprior.checks import check_between
+from warmprior.checks import check_between, check_choice
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
-from warmprior.options.data import IMAGE_SIZE
+from warmprior.options.data import IMAGE_SIZE, Resize
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 
@@ -141,6 +141,7 @@ class WarmFlowConfig(PreTrainedConfig):
         encoders = ("resnet18-imagenet", "resnet18", "small")
         if self.encoder not in encoders:
             raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")
+        check_choice("--policy.resize", self.resize, get_args(Resize))
         mode = self.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
         if self.image_features and mode != NormalizationMode.IDENTITY:
             raise ValueError(

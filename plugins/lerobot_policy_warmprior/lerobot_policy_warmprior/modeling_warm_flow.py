@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
+from lerobot_policy_warmprior.used import check_used, recording_of
 from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
@@ -92,6 +93,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None:
             check_statistics(config, dataset_meta)
+            check_used(config)
         prior = config.make_prior()
         if isinstance(prior, nn.Module):
             raise ValueError(
@@ -145,6 +147,9 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             network = VisionNetwork(encoder, network)
         if config.precondition and not preconditioned:
             network = self._preconditioned(network, prior, dataset_meta)
+        if dataset_meta is not None:  # the preconditioning recognises the joints
+            used = recording_of(config, dataset_meta, training_episodes(dataset_meta))
+            logging.info("%s", used.text("--policy.{}"))
         # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
         # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX

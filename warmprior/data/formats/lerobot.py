@@ -121,6 +121,13 @@ class LeRobotReader(DemonstrationReader):
                 check_shape(f"{feature} of episode {demo}", decoded, (stop - first, *shape))
                 yield decoded
 
+    @override
+    def decoders(self, key: str) -> Sequence[str]:
+        if self.index.images[key] not in self.index.videos:
+            return ("pillow",)
+        backend = require("lerobot.utils.import_utils", "lerobot").get_safe_default_video_backend()
+        return "lerobot", {"pyav": "av"}.get(backend, backend)
+
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
         decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
         times = self._rows(episode, "timestamp")[:, 0].astype(np.float64)

@@ -157,6 +157,10 @@ class MinariReader(DemonstrationReader):
         yield torch.from_numpy(images).permute(0, 3, 1, 2)
 
     @override
+    def decoders(self, key: str) -> Sequence[str]:
+        return "minari", "pillow"  # it may store JPEG
+
+    @override
     def name(self, demo: str, key: str) -> str:
         return f"{self._path}: {key.removeprefix('obs/')} of episode {demo}"
 

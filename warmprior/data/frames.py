@@ -1,0 +1,128 @@
+"""Images at the size that policies see: decoded and resized once, then kept in a cache on the disk."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import suppress
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from filelock import FileLock
+from tensordict import MemoryMappedTensor
+from torch import Tensor
+
+from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
+from warmprior.io.files import cache_folder, digest_of, write_atomic
+from warmprior.io.progress import progress_bar
+from warmprior.modules.resize import resized
+
+FRAMES_VERSION = 1
+"""The version of reading here; it is raised whenever the same contents give other images."""
+
+CACHE_BYTES = 50 * 2**30
+"""The size from which on images that were not used lately leave the cache."""
+
+LATELY = 24 * 3600
+"""The seconds after the last use in which images stay in the cache, whatever its size."""
+
+
+def image_shape(index: DatasetIndex) -> tuple[int, int, int, int]:
+    """Return the shape of all images of a camera, ``(N, 3, size, size)``."""
+    return sum(index.lengths), 3, index.image_size, index.image_size
+
+
+def read_images(index: DatasetIndex, reader: DemonstrationReader, key: str, out: Tensor) -> None:
+    """Read and resize the images of a camera into a tensor, uint8 ``[N, 3, size, size]``."""
+    # A bar only for images, which take long because they are unpacked one by one.
+    bar = progress_bar(f"read {key} of {index.path.name}", index.demos, unit="demo")
+    for demo, (start, stop) in zip(bar, pairwise(np.cumsum([0, *index.lengths])), strict=True):
+        images, first = out[start:stop], 0
+        for block in reader.images(demo, key):
+            part = images[first : first + len(block)]
+            part.copy_(resized(block, (index.image_size,) * 2, index.resize)[: len(part)])
+            first += len(block)
+        if first != len(images):
+            raise DatasetError(
+                f"{index.path}: demo {demo} has {first} images {key} for {len(images)} steps: record it "
+                "again or leave it out"
+            )
+
+
+def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, contents: str) -> Tensor:
+    """Return the images of a camera as a memory map of the cache, uint8 ``[N, 3, size, size]``.
+
+    The first call for the same contents, demonstrations, size, way of resizing and versions of decoders
+    and PyTorch reads them, while other processes that ask for these wait. Images of every format go this way,
+    also those that need no decoding: each demonstration of a file has its own array, channels last, so a copy
+    is needed anyway, and here all runs share it.
+
+    The cache is the folder ``images`` in ``$WARMPRIOR_CACHE``, or in ``~/.cache/warmprior`` if that is not
+    set. When it exceeds 50 GiB after images were added, those used longest ago leave it, but none of the last
+    day. The whole folder may be removed at any time between runs.
+
+    The files are read-only, so that values written to the map stay in this process; a user who may write to
+    any file (root) changes the cache.
+
+    Args:
+        index: the index.
+        reader: the reader of its values.
+        key: the name of the images.
+        contents: the digest of what the place holds, see :meth:`Demonstrations.contents`.
+
+    Raises:
+        DatasetError: if images cannot be read.
+        OSError: if they cannot be stored.
+    """
+    shape, feature = image_shape(index), index.images.get(key, key)
+    options = index.demos, index.lengths, feature, index.image_size, index.resize
+    versions = [(package, version(package)) for package in ("torch", *reader.decoders(key))]
+    identity = digest_of(FRAMES_VERSION, versions, contents, *options)
+    path = cache_folder() / "images" / f"{identity}.bytes"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(path.with_suffix(".lock")):
+            # A file system that lost its last writes may hold a shorter file.
+            if not path.exists() or path.stat().st_size != torch.Size(shape).numel():
+                write_atomic(path, lambda temporary: _write(temporary, index, reader, key))
+                _clean(path.parent)
+            with suppress(OSError):  # of another user, who shares the folder
+                os.utime(path)
+            return MemoryMappedTensor.from_filename(path, torch.uint8, shape)
+    except OSError as error:
+        raise OSError(
+            f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
+            f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
+        ) from error
+
+
+def _write(path: Path, index: DatasetIndex, reader: DemonstrationReader, key: str) -> None:
+    out = MemoryMappedTensor.empty(image_shape(index), dtype=torch.uint8, filename=str(path))
+    reserve(out)
+    read_images(index, reader, key, out)
+    path.chmod(0o444)
+
+
+def reserve(mapped: MemoryMappedTensor) -> None:
+    """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with open(mapped.filename, "r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
+
+
+def _clean(folder: Path) -> None:
+    """Remove the files used longest ago, but none of the last day, until the others are small enough.
+
+    That includes locks, and what killed processes left.
+    """
+    found = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in folder.iterdir())
+    excess = sum(size for _, size, _ in found) - CACHE_BYTES
+    for used, size, path in found:
+        if excess <= 0 or time.time() - used < LATELY:
+            return
+        path.unlink(missing_ok=True)
+        excess -= size
