@@ -236,7 +236,8 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             worst = rest.farthest(steps[keys.OBSERVATION], steps[keys.ACTION])
             if worst is None:
                 config.joints = key
-                logging.info("the actions are absolute targets of %s: joints=%s", key, key)
+                advice = "" if config.prior == "gaussian" else "; --policy.prior=gaussian suits them best"
+                logging.info("the actions are absolute targets of %s: joints=%s%s", key, key, advice)
                 return rest
             if asked != "auto":
                 raise ValueError(
