@@ -19,10 +19,10 @@ TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
 
 PLAYED = re.compile(
-    r"(?<=<!-- )(rows|sigma|chunk|curvature|slope|forecasts) (\w+)( -->\n).*?(?=<!-- end -->)", re.S
+    r"(?<=<!-- )(rows|sigma|chunk|curvature|slope|forecasts|agents) (\w+)( -->\n).*?(?=<!-- end -->)", re.S
 )
 """This matches the table of a run in a page: by NFE and noise, sigma, chunk length or
-slope, of curvature, or of forecasts' errors."""
+slope, of curvature, of forecasts' errors, or of agents."""
 
 
 def played_table(name: str) -> str:
@@ -146,6 +146,25 @@ def forecasts_table(name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def agents_table(name: str) -> str:
+    """Return success of agents in Markdown, in percent, by control steps: a line per training."""
+    rows = read_json(DATA / f"{name}.jsonl", lines=True)
+    recipe = ["source", "nfe", "residual_length", "updates", "noise_critic_steps"]
+    heads = ["source, NFE", "residuals", "updates + distillation", "frozen policy", "control steps"]
+    heads += ["greedy agent", "episodes of the training"]
+    text = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for (source, nfe, length, updates, distillation), part in rows.groupby(recipe, sort=False):
+        played = part.dropna(subset="greedy_episodes")
+        solved = 100 * played["greedy_successes"] / played["greedy_episodes"]
+        trained = 100 * part["training_successes"] / part["training_episodes"]
+        cells = [f"{SOURCES[source][0]}, {nfe}", f"{length}", f"{updates} + {distillation}"]
+        cells += [f"{100 * part['base_successes'].iloc[0] / played['greedy_episodes'].iloc[0]:.0f}"]
+        cells += [", ".join(f"{steps:,}" for steps in part["control_steps"])]
+        cells += [", ".join(f"{rate:.0f}" for rate in each) for each in (solved, trained)]
+        text.append(f"| {' | '.join(cells)} |")
+    return "\n".join(text) + "\n"
+
+
 def with_tables(page: str, tables: Sequence[str]) -> str:
     """Return a page with its tables, in their order, and those of the runs whose rows it names."""
     if len(places := TABLE.findall(page)) != len(tables):
@@ -155,7 +174,7 @@ def with_tables(page: str, tables: Sequence[str]) -> str:
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
         kinds = {"rows": played_table, "curvature": curvature_table, "slope": slope_table}
-        kinds |= {"forecasts": forecasts_table}
+        kinds |= {"forecasts": forecasts_table, "agents": agents_table}
         drawn = kinds.get(kind, partial(study_table, kind))
         return f"{kind} {name}{end}{drawn(name)}"
 
