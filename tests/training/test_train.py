@@ -111,7 +111,7 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
     write_robomimic_file(tmp_path / "images.hdf5", lengths=(30,))
     RobomimicDemonstrations(tmp_path / "images.hdf5").steps(images=("agentview_image",))
     said = capsys.readouterr().err
-    shown = [f"{name}:" in said for name in ("train", "agent", "play", "read images.hdf5")]
+    shown = [f"{name}:" in said for name in ("train", "agent", "play", "of images.hdf5")]
     assert shown == [not turned_off] * 4
 
 

@@ -141,7 +141,7 @@ def _in_words(path: tuple[str, ...], old: Any, new: Any) -> str:
     if not _is_digest(old) or not _is_digest(new):
         return f"{path[-1]} was {old} and is {new}"
     if path[-1] == "buffers":
-        return f"the untrained values of {part} differ"
+        return f"the untrained values of {part}, such as statistics of the demonstrations, differ"
     return DIGESTS.get(path[-1], f"the {path[-1]} of {part} differs")
 
 
