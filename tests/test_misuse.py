@@ -76,6 +76,15 @@ def test_a_generator_does_not_draw_in_forked_workers():
 
     assert drawn() == 2 * [policy(data.copy())[CHUNK].shape]
 
+    @apart
+    def made():
+        return pickle.dumps([policy, policy.replace(generator=torch.Generator())])
+
+    left, own = pickle.loads(made())
+    with raises(RuntimeError, "same noise", "set_seed"):
+        left(data.copy())
+    assert own(data.copy())[CHUNK].shape == policy(data.copy())[CHUNK].shape
+
 
 def test_a_policy_with_a_generator_can_be_sent():
     """An error while TorchRL's collectors send a policy would leave its weights on the device meta."""

@@ -16,8 +16,8 @@ import h5py
 
 from tests.errors import raises
 from tests.processes import apart
-from warmprior.data import frames, open_demonstrations
-from warmprior.data.formats.hdf5 import RobomimicReader
+from warmprior.data import DatasetError, frames, open_demonstrations
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
 
 STEPS = 6
 
@@ -123,16 +123,45 @@ def test_the_second_of_two_processes_waits_for_the_first(recorded, monkeypatch, 
     assert (tmp_path / "log").read_text().split() == ["demo_0", "demo_1"]
 
 
-def test_maps_are_shared_and_protected(recorded):
+def test_maps_are_shared_and_never_of_a_file_that_is_gone(recorded, read):
     path, images, folder = recorded
     data = front(path)
     assert torch.equal(pickle.loads(pickle.dumps(data)), images)  # as to a worker process
     assert len(pickle.dumps(data)) < images.numel()
     (kept,) = folder.glob("*.bytes")
-    assert kept.stat().st_mode & 0o777 == 0o444
-    if not os.access(kept, os.W_OK):  # root may write
-        data.fill_(0)
-        assert torch.equal(front(path), images)
+    sent = pickle.dumps(data)
+    kept.unlink()
+    pickle.loads(sent)  # PyTorch makes a file of zeros
+    assert kept.stat().st_size == images.numel() and not any(kept.read_bytes())
+    assert torch.equal(front(path), images) and len(read) == 4
+
+
+@pytest.mark.parametrize("moment", ["opened", "read"])
+def test_a_file_that_is_replaced_while_it_is_read_is_refused(recorded, monkeypatch, moment):
+    path, images, folder = recorded
+    other = path.with_name("other.hdf5")
+    other.write_bytes(path.read_bytes())
+    with h5py.File(other, "a") as file:
+        file["data/demo_1/obs/front"][0] = 7
+    owner, name = (RobomimicDemonstrations, "reader") if moment == "opened" else (RobomimicReader, "images")
+    original, before = getattr(owner, name), path.read_bytes()
+
+    def replacing(self, *args):
+        other.replace(path)
+        return original(self, *args)
+
+    with monkeypatch.context() as patched, raises(DatasetError, "recorded.hdf5", "changed"):
+        patched.setattr(owner, name, replacing if moment == "opened" else once(replacing, original))
+        front(path)
+    assert not list(folder.glob("*.bytes")) and (front(path)[STEPS] == 7).all()
+    path.write_bytes(before)
+    assert torch.equal(front(path), images)
+
+
+def once(first, then):
+    """A method that is ``first`` at its first call, and ``then`` later."""
+    calls = iter([first])
+    return lambda self, *args: next(calls, then)(self, *args)
 
 
 def test_a_full_cache_loses_what_was_used_longest_ago(recorded, read, monkeypatch):
@@ -142,7 +171,7 @@ def test_a_full_cache_loses_what_was_used_longest_ago(recorded, read, monkeypatc
         before = {*folder.glob("*.bytes")}
         front(path, image_size=size)
         (found[age],) = {*folder.glob("*.bytes")} - before
-        os.utime(found[age], (time.time() - age * 86_400,) * 2)
+        os.utime(found[age], (time.time() - 30 * age * 86_400,) * 2)
     front(path, image_size=10)  # a use keeps it
     later = 2 * STEPS * 3 * 16**2
     monkeypatch.setattr(frames, "CACHE_BYTES", later + sum(found[n].stat().st_size for n in (3, 2, 0.5)))

@@ -75,6 +75,8 @@ def test_residuals_are_held(residuals):
     assert networks(data)["prior", "delta"].shape == drawn.shape == (5, residuals, D_A)
     with raises(ValueError, "residual_length (3)", "(4)"):
         PriorDecoder(actor, delta=0.5, residual_length=3)
+    with raises(ValueError, "residual_length (3)", "(4)"):
+        make_prior_space_actor(**decoder.sizes | {"residual_length": 3}, delta=0.5)
 
 
 class Slope(torch.nn.Module):

@@ -253,8 +253,8 @@ class Demonstrations:
             OSError: if a download fails, or there is no space for memory maps.
         """
         index = self.index(observations, images, poses=actions == "absolute")
+        contents = partial(self.contents, index)
+        digest = contents() if storage == "memmap" and index.image_keys else ""
+        options: Any = {"actions": actions, "storage": storage, "scratch_dir": scratch_dir}
         with self.reader(index) as reader:
-            contents = partial(self.contents, index)
-            return read_steps(
-                index, reader, contents, actions=actions, storage=storage, scratch_dir=scratch_dir
-            )
+            return read_steps(index, reader, contents, digest=digest, **options)

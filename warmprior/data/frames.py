@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import stat
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from itertools import pairwise
@@ -26,8 +28,11 @@ FRAMES_VERSION = 1
 CACHE_BYTES = 50 * 2**30
 """The size from which on images that were not used lately leave the cache."""
 
-LATELY = 24 * 3600
+LATELY = 30 * 24 * 3600
 """The seconds after the last use in which images stay in the cache, whatever its size."""
+
+COMPLETE = 0o644
+"""The mode of a file with all its images; PyTorch maps a file that is gone as a new one of zeros, in 0600."""
 
 
 def image_shape(index: DatasetIndex) -> tuple[int, int, int, int]:
@@ -52,7 +57,9 @@ def read_images(index: DatasetIndex, reader: DemonstrationReader, key: str, out:
             )
 
 
-def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, contents: str) -> Tensor:
+def cached_images(
+    index: DatasetIndex, reader: DemonstrationReader, key: str, digest: str, contents: Callable[[], str]
+) -> Tensor:
     """Return the images of a camera as a memory map of the cache, uint8 ``[N, 3, size, size]``.
 
     The first call for the same contents, demonstrations, size, way of resizing and versions of decoders
@@ -62,48 +69,63 @@ def cached_images(index: DatasetIndex, reader: DemonstrationReader, key: str, co
 
     The cache is the folder ``images`` in ``$WARMPRIOR_CACHE``, or in ``~/.cache/warmprior`` if that is not
     set. When it exceeds 50 GiB after images were added, those used longest ago leave it, but none of the last
-    day. The whole folder may be removed at any time between runs.
-
-    The files are read-only, so that values written to the map stay in this process; a user who may write to
-    any file (root) changes the cache.
+    30 days. The whole folder may be removed at any time between runs. The map is shared, so that it may be
+    larger than the memory: do not write to it.
 
     Args:
         index: the index.
         reader: the reader of its values.
         key: the name of the images.
-        contents: the digest of what the place holds, see :meth:`Demonstrations.contents`.
+        digest: the digest of what the place held before the reader opened it, see
+            :meth:`Demonstrations.contents`.
+        contents: returns the digest of what it holds now.
 
     Raises:
-        DatasetError: if images cannot be read.
+        DatasetError: if images cannot be read, or the place changes meanwhile.
         OSError: if they cannot be stored.
     """
     shape, feature = image_shape(index), index.images.get(key, key)
     options = index.demos, index.lengths, feature, index.image_size, index.resize
     versions = [(package, version(package)) for package in ("torch", *reader.decoders(key))]
-    identity = digest_of(FRAMES_VERSION, versions, contents, *options)
+    identity = digest_of(FRAMES_VERSION, versions, digest, *options)
     path = cache_folder() / "images" / f"{identity}.bytes"
+
+    def write(temporary: Path) -> None:
+        _write(temporary, index, reader, key)
+        if contents() != digest:
+            raise DatasetError(f"{index.path} changed while it was read: read it again")
+        temporary.chmod(COMPLETE)
+
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(path.with_suffix(".lock")):
-            # A file system that lost its last writes may hold a shorter file.
-            if not path.exists() or path.stat().st_size != torch.Size(shape).numel():
-                write_atomic(path, lambda temporary: _write(temporary, index, reader, key))
-                _clean(path.parent)
-            with suppress(OSError):  # of another user, who shares the folder
-                os.utime(path)
-            return MemoryMappedTensor.from_filename(path, torch.uint8, shape)
-    except OSError as error:
+        if not _is_complete(path, shape):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(path.with_suffix(".lock"), mode=0o666):
+                if not _is_complete(path, shape):
+                    write_atomic(path, write)
+                    _clean(path.parent)
+        with suppress(OSError):  # of another user, who shares the folder
+            os.utime(path)
+        return MemoryMappedTensor.from_filename(path, torch.uint8, shape)
+    except (OSError, RuntimeError) as error:  # PyTorch's own error of a map is the latter
         raise OSError(
             f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
             f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
         ) from error
 
 
+def _is_complete(path: Path, shape: Sequence[int]) -> bool:
+    """Return True unless the file is missing, was never finished, or lost what was written last."""
+    try:
+        found = path.stat()
+    except OSError:
+        return False
+    return (stat.S_IMODE(found.st_mode), found.st_size) == (COMPLETE, torch.Size(shape).numel())
+
+
 def _write(path: Path, index: DatasetIndex, reader: DemonstrationReader, key: str) -> None:
     out = MemoryMappedTensor.empty(image_shape(index), dtype=torch.uint8, filename=str(path))
     reserve(out)
     read_images(index, reader, key, out)
-    path.chmod(0o444)
 
 
 def reserve(mapped: MemoryMappedTensor) -> None:
@@ -115,14 +137,18 @@ def reserve(mapped: MemoryMappedTensor) -> None:
 
 
 def _clean(folder: Path) -> None:
-    """Remove the files used longest ago, but none of the last day, until the others are small enough.
+    """Remove the files used longest ago, but none used lately, until the others are small enough.
 
-    That includes locks, and what killed processes left.
+    That includes locks, and what killed processes left. Others may clean at the same time.
     """
-    found = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in folder.iterdir())
+    found = []
+    for path in folder.iterdir():
+        with suppress(OSError):
+            found.append((path.stat().st_mtime, path.stat().st_size, path))
     excess = sum(size for _, size, _ in found) - CACHE_BYTES
-    for used, size, path in found:
-        if excess <= 0 or time.time() - used < LATELY:
-            return
-        path.unlink(missing_ok=True)
+    for _, size, path in sorted(found):
+        with suppress(OSError):
+            if excess <= 0 or time.time() - path.stat().st_mtime < LATELY:
+                return
+            path.unlink()
         excess -= size

@@ -45,13 +45,15 @@ def read_steps(
     reader: DemonstrationReader,
     contents: Callable[[], str],
     *,
+    digest: str = "",
     actions: StoredActions = "delta",
     storage: Storage = "memory",
     scratch_dir: str | Path | None = None,
 ) -> TensorDict:
     """Return the values of demonstrations; see :meth:`Demonstrations.steps` for entries and options.
 
-    ``contents`` returns the digest of what the place holds.
+    ``contents`` returns the digest of what the place holds. ``digest`` is the one before the reader opened
+    it, which images in memory do not need.
     """
     check_choice("storage", storage, get_args(Storage))
     check_choice("actions", actions, get_args(StoredActions))
@@ -63,9 +65,9 @@ def read_steps(
         for key in index.image_keys:
             read_images(index, reader, key, data[OBSERVATION, key])
     elif index.image_keys:
-        digest, data = contents(), data.clone(False)  # a map in files of its own takes no others
+        data = data.clone(False)  # a map in files of its own takes no others
         for key in index.image_keys:
-            data[OBSERVATION, key] = cached_images(index, reader, key, digest)
+            data[OBSERVATION, key] = cached_images(index, reader, key, digest, contents)
     return data
 
 

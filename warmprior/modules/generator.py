@@ -45,9 +45,15 @@ class Drawing:
 
     def __getstate__(self) -> Any:
         state: Any = super().__getstate__()
-        if self.generator is not None and get_spawning_popen() is not None:
-            state = {**state, "_generator": LeftBehind()}
-        return state
+        generator = self.generator
+        if generator is not None and get_spawning_popen() is not None:
+            generator = LeftBehind()
+        return {**state, "_generator": generator}
+
+    def __setstate__(self, state: Any) -> None:
+        parent: Any = super()
+        parent.__setstate__(state)
+        self._set_after = _forks  # those of the process that loads it
 
     def chosen_generator(self, generator: torch.Generator | None = None) -> torch.Generator | None:
         """Return a call's generator, or the module's; raise RuntimeError if that one stayed elsewhere."""

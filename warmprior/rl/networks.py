@@ -80,6 +80,10 @@ class _Sizes:
             observation_steps=observation_steps,
             residual_length=length,
         )
+        if prediction_length % length:
+            raise ValueError(
+                f"residual_length ({length}) must divide the prediction length ({prediction_length})"
+            )
         self.observation = (observation_steps, observation_dim)
         self.chunk, self.residual = (prediction_length, action_dim), (length, action_dim)
 

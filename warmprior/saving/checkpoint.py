@@ -133,7 +133,8 @@ def differences(before: Any, now: Any) -> str:
     """
     found = {path: _in_words(path, old, new) for path, old, new in _leaves((), before, now)}
     # Untrained values mostly follow from other differences.
-    return "; ".join(text for path, text in found.items() if path[-1] != "buffers" or len(found) == 1)
+    options = [text for path, text in found.items() if path[-1] != "buffers"]
+    return "; ".join(options or found.values())
 
 
 def _in_words(path: tuple[str, ...], old: Any, new: Any) -> str:
