@@ -10,7 +10,7 @@ import numpy as np
 from tests.fuzz.sandbox import Outcome
 
 Case = tuple[str, Callable[[], Outcome], str]
-"""How a file was damaged, the load to attempt, and what its error has to name."""
+"""This holds how a file was damaged, the load to attempt, and what its error has to name."""
 
 ODD_VALUES: tuple[Any, ...] = (
     *(None, True, 0, -1, 3, 10**5, 10**9, 10**30, 0.5, -0.5, 1e308, float("nan"), float("inf")),

@@ -93,7 +93,7 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
 
 
 def _says_so(read: RobomimicDemonstrations, data: TensorDictBase, actions: str) -> bool:
-    """Whether h5py alone reads the same."""
+    """Return True if h5py alone reads the same."""
     index = read.index()
     with h5py.File(read.path) as file:
         demos = sorted(file["data"], key=lambda name: int(name[5:]))
@@ -148,7 +148,7 @@ def mutate_datasets(folder: Path, rng: np.random.Generator) -> Case:
 
 
 def _table_says_so(folder: Path, data: TensorDictBase, mask: str | None, actions: str) -> bool:
-    """Whether pyarrow alone reads the same."""
+    """Return True if pyarrow alone reads the same."""
     table = parquet.read_table(folder / "data/chunk-000/file-000.parquet")
     rows = np.array(table["episode_index"]) == 0 if mask else np.s_[:]
 

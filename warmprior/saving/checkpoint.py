@@ -117,7 +117,7 @@ DIGESTS = {
     "data": "the demonstrations, or what is read of them, differ",
     "policy": "the policy differs",
 }
-"""What the digests of a configuration stand for."""
+"""This says what the digests of a configuration stand for."""
 
 
 def differences(before: Any, now: Any) -> str:

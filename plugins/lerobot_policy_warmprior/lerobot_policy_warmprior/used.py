@@ -1,4 +1,4 @@
-"""What a training of warm_flow uses of a dataset, and what it does not."""
+"""This module says what a training of warm_flow uses of a dataset, and what it does not."""
 
 from __future__ import annotations
 
