@@ -19,7 +19,14 @@ from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import Algorithm
 from warmprior.options.evaluation import EVALUATION_SEED
-from warmprior.options.train_command import Data, Evaluation, Run, Source
+from warmprior.options.train_command import (
+    DEFAULT_PRIOR,
+    PRIOR_OF_TARGETS,
+    Data,
+    Evaluation,
+    Run,
+    Source,
+)
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
@@ -312,7 +319,7 @@ def train(
     from warmprior.training.option_text import make
 
     check_device(run.device)  # before the demonstrations are read
-    make(Prior, source.prior or "gaussian", source.chunk)  # an error is better raised here
+    make(Prior, source.prior or DEFAULT_PRIOR, source.chunk)  # an error is better raised here
     sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
         place,
@@ -346,7 +353,7 @@ def train(
     if held_out is None:
         held_out = min(count - 1, max(1, count // 10)) if whole.environment is None else 0
     task, left_out = whole.split(held_out)
-    text = source.prior or ("past,correlation=0.5" if task.rest is None else "gaussian")
+    text = source.prior or (DEFAULT_PRIOR if task.rest is None else PRIOR_OF_TARGETS)
     prior, options = make(Prior, text, source.chunk), text.split(",")[1:]
     print(f"{task.recording.text('--{}')}\n{'source':13} {text} (--prior)", flush=True)
     name = f"{task.name}-{task.style}-{','.join([prior.name, *options])}-seed{training.seed}"

@@ -136,6 +136,16 @@ def test_maps_are_shared_and_never_of_a_file_that_is_gone(recorded, read):
     assert torch.equal(front(path), images) and len(read) == 4
 
 
+def test_images_that_vanish_before_they_are_mapped_are_no_zeros(recorded, monkeypatch):
+    path, images, folder = recorded
+    front(path)
+    (kept,) = folder.glob("*.bytes")
+    with monkeypatch.context() as patched, raises(OSError, "removed", str(folder)):
+        patched.setattr(os, "utime", lambda path: kept.unlink())
+        front(path)
+    assert torch.equal(front(path), images)
+
+
 @pytest.mark.parametrize("moment", ["opened", "read"])
 def test_a_file_that_is_replaced_while_it_is_read_is_refused(recorded, monkeypatch, moment):
     path, images, folder = recorded

@@ -13,6 +13,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from warmprior.checks import check_choice, check_whole_numbers, given
+from warmprior.data.frames import cached_images
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
@@ -110,17 +111,14 @@ class Demonstrations:
 
     def recording(self, index: DatasetIndex, actions: str | None = None) -> Recording:
         """Return what is read of the demonstrations, what is left out, and what ``actions`` are, in words."""
-        sized, shapes = (
-            (index.image_size, index.resize),
-            dict(zip(index.image_keys, index.image_shapes, strict=True)),
-        )
+        shapes = dict(zip(index.image_keys, index.image_shapes, strict=True))
         return Recording(
             self.name,
             len(index.demos),
             sum(index.lengths),
             actions or f"[{index.action_dim}]{AS_RECORDED}",
             dict(zip(index.observation_keys, index.observation_dims, strict=True)),
-            {key: image_words(shape, *sized) for key, shape in shapes.items()},
+            {key: image_words(shape, index.image_size, index.resize) for key, shape in shapes.items()},
             {key: index.images[key] for key in index.image_keys if key in index.images},
             index.left_out,
             index.rate,
@@ -257,4 +255,5 @@ class Demonstrations:
         digest = contents() if storage == "memmap" and index.image_keys else ""
         options: Any = {"actions": actions, "storage": storage, "scratch_dir": scratch_dir}
         with self.reader(index) as reader:
-            return read_steps(index, reader, contents, digest=digest, **options)
+            cached = partial(cached_images, index, reader, digest=digest, contents=contents)
+            return read_steps(index, reader, cached, **options)

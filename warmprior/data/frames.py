@@ -18,7 +18,7 @@ from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
-from warmprior.io.files import cache_folder, digest_of, write_atomic
+from warmprior.io.files import cache_folder, digest_of, reserve, write_atomic
 from warmprior.io.progress import progress_bar
 from warmprior.modules.resize import resized
 
@@ -105,12 +105,15 @@ def cached_images(
                     _clean(path.parent)
         with suppress(OSError):  # of another user, who shares the folder
             os.utime(path)
-        return MemoryMappedTensor.from_filename(path, torch.uint8, shape)
-    except (OSError, RuntimeError) as error:  # PyTorch's own error of a map is the latter
+        images = MemoryMappedTensor.from_filename(path, torch.uint8, shape)
+        if not _is_complete(path, shape):
+            raise FileNotFoundError(f"{path} was removed meanwhile: read it again")
+    except OSError as error:
         raise OSError(
             f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
             f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
         ) from error
+    return images
 
 
 def _is_complete(path: Path, shape: Sequence[int]) -> bool:
@@ -126,14 +129,6 @@ def _write(path: Path, index: DatasetIndex, reader: DemonstrationReader, key: st
     out = MemoryMappedTensor.empty(image_shape(index), dtype=torch.uint8, filename=str(path))
     reserve(out)
     read_images(index, reader, key, out)
-
-
-def reserve(mapped: MemoryMappedTensor) -> None:
-    """Reserve the space of a memory map: writing without it would kill the process (SIGBUS)."""
-    if not hasattr(os, "posix_fallocate"):
-        return
-    with open(mapped.filename, "r+b") as file:
-        os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
 
 
 def _clean(folder: Path) -> None:

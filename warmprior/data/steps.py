@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_choice
-from warmprior.data.frames import cached_images, image_shape, read_images, reserve
+from warmprior.data.frames import image_shape, read_images
 from warmprior.data.index import (
     BLOCK,
     MISFIT,
@@ -30,6 +30,7 @@ from warmprior.data.index import (
 )
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
+from warmprior.io.files import reserve
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
@@ -43,17 +44,15 @@ StoredActions = Literal["delta", "absolute", "stored"]
 def read_steps(
     index: DatasetIndex,
     reader: DemonstrationReader,
-    contents: Callable[[], str],
+    cached: Callable[[str], Tensor],
     *,
-    digest: str = "",
     actions: StoredActions = "delta",
     storage: Storage = "memory",
     scratch_dir: str | Path | None = None,
 ) -> TensorDict:
     """Return the values of demonstrations; see :meth:`Demonstrations.steps` for entries and options.
 
-    ``contents`` returns the digest of what the place holds. ``digest`` is the one before the reader opened
-    it, which images in memory do not need.
+    ``cached`` returns the images of a camera by their name, as a memory map.
     """
     check_choice("storage", storage, get_args(Storage))
     check_choice("actions", actions, get_args(StoredActions))
@@ -67,7 +66,7 @@ def read_steps(
     elif index.image_keys:
         data = data.clone(False)  # a map in files of its own takes no others
         for key in index.image_keys:
-            data[OBSERVATION, key] = cached_images(index, reader, key, digest, contents)
+            data[OBSERVATION, key] = cached(key)
     return data
 
 

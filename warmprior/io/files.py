@@ -62,6 +62,14 @@ def is_repository(name: str) -> bool:
     return bool(re.fullmatch(f"{part}/{part}", name))
 
 
+def reserve(mapped: Any) -> None:
+    """Reserve the space of a tensor that is mapped: writing without it would kill the process (SIGBUS)."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with open(mapped.filename, "r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, max(1, mapped.numel() * mapped.element_size()))
+
+
 def cache_folder() -> Path:
     """Return the folder of generated files: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
     return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

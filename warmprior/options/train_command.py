@@ -7,6 +7,12 @@ from pathlib import Path
 
 from warmprior.options.data import Actions, Resizing
 
+DEFAULT_PRIOR = "past,correlation=0.5"
+"""The source of ``train`` and of the plugin, with its options, unless actions are absolute targets."""
+
+PRIOR_OF_TARGETS = "gaussian"
+"""The source of ``train`` for absolute targets, which the plugin advises."""
+
 
 @dataclass(frozen=True)
 class Data(Resizing):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from warmprior import keys
-from warmprior.checks import check_keys
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
@@ -61,6 +61,17 @@ def residual_sigma(actor: Any) -> float:
         return actor.start.noise_share
     # The sigma of a learned source multiplies its own scale.
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
+
+
+def length_of_residuals(residual_length: int | None, prediction_length: int) -> int:
+    """Return the number of residuals per chunk, one per action by default; raise ValueError if not a divisor."""
+    length = prediction_length if residual_length is None else residual_length
+    check_whole_numbers(residual_length=length)
+    if prediction_length % length:
+        raise ValueError(
+            f"residual_length ({length}) must divide the prediction length ({prediction_length})"
+        )
+    return length
 
 
 def held(delta: Tensor, length: int) -> Tensor:

@@ -16,7 +16,7 @@ from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positive, check_shape, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.generator import Drawing
-from warmprior.rl.anchor import has_anchor, held, residual_sigma
+from warmprior.rl.anchor import has_anchor, held, length_of_residuals, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
 
@@ -81,13 +81,7 @@ class PriorDecoder(TensorDictModuleBase):
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         self.requires_grad_(False).eval()
         self.prediction_length = actor.prior.prediction_length
-        self.residual_length = self.prediction_length if residual_length is None else residual_length
-        check_whole_numbers(residual_length=self.residual_length)
-        if self.prediction_length % self.residual_length:
-            raise ValueError(
-                f"residual_length ({self.residual_length}) must divide the prediction length "
-                f"({self.prediction_length})"
-            )
+        self.residual_length = length_of_residuals(residual_length, self.prediction_length)
         #: The number ``d_a``, or ``None`` if the network does not have it.
         self.action_dim = getattr(actor.network, "action_dim", None)
         self.observation_key = self.ode.observation_key

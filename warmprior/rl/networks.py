@@ -15,6 +15,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
 from warmprior.checks import check_distinct, check_positive, check_whole_numbers
+from warmprior.rl.anchor import length_of_residuals
 
 
 class BoxTanhNormal(TanhNormal):
@@ -72,18 +73,13 @@ class _Sizes:
         observation_steps: int,
         residual_length: int | None,
     ) -> None:
-        length = prediction_length if residual_length is None else residual_length
         check_whole_numbers(
             action_dim=action_dim,
             observation_dim=observation_dim,
             prediction_length=prediction_length,
             observation_steps=observation_steps,
-            residual_length=length,
         )
-        if prediction_length % length:
-            raise ValueError(
-                f"residual_length ({length}) must divide the prediction length ({prediction_length})"
-            )
+        length = length_of_residuals(residual_length, prediction_length)
         self.observation = (observation_steps, observation_dim)
         self.chunk, self.residual = (prediction_length, action_dim), (length, action_dim)
 

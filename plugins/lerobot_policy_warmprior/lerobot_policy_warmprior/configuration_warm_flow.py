@@ -12,13 +12,14 @@ from lerobot.optim.schedulers import LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from lerobot_policy_warmprior.configuration_warm_vla import DEFAULT_PRIOR, OWN_PRIORS
+from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
 from warmprior import Prior
 from warmprior.checks import check_between, check_choice
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
+from warmprior.options.train_command import DEFAULT_PRIOR
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 

@@ -12,10 +12,8 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from warmprior import Prior
 from warmprior.lerobot import history_indices
 from warmprior.modules.registry import registered
+from warmprior.options.train_command import DEFAULT_PRIOR
 from warmprior.training.option_text import build
-
-DEFAULT_PRIOR = "past,correlation=0.5"
-"""The default of this library's command line too."""
 
 OWN_PRIORS = (
     "LeRobot imports your own by --policy.discover_packages_path=PACKAGE, and with --policy.path by "

@@ -45,6 +45,7 @@ from warmprior.lerobot.names import named_joints
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.modules.resize import resized
+from warmprior.options.train_command import PRIOR_OF_TARGETS
 from warmprior.training import ema_of, precondition
 
 
@@ -236,7 +237,8 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             worst = rest.farthest(steps[keys.OBSERVATION], steps[keys.ACTION])
             if worst is None:
                 config.joints = key
-                advice = "" if config.prior == "gaussian" else "; --policy.prior=gaussian suits them best"
+                best = PRIOR_OF_TARGETS
+                advice = "" if config.prior == best else f"; --policy.prior={best} suits them best"
                 logging.info("the actions are absolute targets of %s: joints=%s%s", key, key, advice)
                 return rest
             if asked != "auto":
