@@ -64,7 +64,7 @@ def residual_sigma(actor: Any) -> float:
 
 
 def length_of_residuals(residual_length: int | None, prediction_length: int) -> int:
-    """Return the number of residuals per chunk, one per action by default; raise ValueError if not a divisor."""
+    """Return how many residuals a chunk has, by default one per action; raise ValueError if not whole."""
     length = prediction_length if residual_length is None else residual_length
     check_whole_numbers(residual_length=length)
     if prediction_length % length:
