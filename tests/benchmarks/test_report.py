@@ -210,6 +210,8 @@ def test_the_terminal_table_fits_and_says_first_what_came_out():
     found = report.summary(pd.concat([compared(), pd.DataFrame(rows)], ignore_index=True), 1)
     *sure, best, facts = report.headline(found, 1).splitlines()
     assert report.terminal_table(found, 1).startswith("\n".join([*sure, best, facts, ""]))
+    ends = [line for width in range(30, 121) for line in report.headline(found, 1, width).splitlines()]
+    assert not [line for line in ends if line.endswith("-")]  # WP-Past stays one word
     assert facts.endswith("H = 8, 3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed.")
     assert best == "Best success: Gaussian source 60.0% at NFE 9; WP-Past 80.0% at NFE 1."
     sure = " ".join(" ".join(sure).split())

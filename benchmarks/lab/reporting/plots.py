@@ -58,13 +58,14 @@ def save(figure: Figure, path: str | Path, title: str, size: int = 10) -> None:
 
 
 def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = False) -> None:
-    """Set title, labels and grid of an axis, and the limits of a rate."""
+    """Set title, labels and grid of an axis, and the limits of a rate, which is shown in percent."""
     axis.set_title(title, fontsize=10)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
     axis.grid(axis="y", alpha=0.25)
     if rate:
         axis.set_ylim(-0.02, 1.08)
+        axis.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f}%")
 
 
 def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
@@ -123,7 +124,7 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
             axis.plot([x] * len(violin), violin["success_rate"], ".", color="black", ms=5)
         axis.text(x, -0.025, f"{k:.4g}/{n}", ha="center", va="top", fontsize=7, color="0.35")
     dots = "; dots: trainings" if rows.groupby(["method", "group"]).size().max() > 1 else ""
-    dress(axis, y=f"success rate (posterior density{dots})")
+    dress(axis, y=f"success rate (posterior density{dots})", rate=True)
     axis.set_ylim(-0.08, 1.0)
     save(figure, path, title)
 

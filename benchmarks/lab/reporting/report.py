@@ -318,7 +318,8 @@ def headline(rows: DataFrame, top_k: int, width: int = 120) -> str:
         *found,
         f"{counted(rows['method'].nunique(), 'method')} on {where}: {_experiment(rows, top_k)}.",
     ]
-    return "\n".join(textwrap.fill(line, width, subsequent_indent="  ") for line in lines)
+    whole: dict[str, Any] = {"subsequent_indent": "  ", "break_on_hyphens": False}  # WP-Past stays one word
+    return "\n".join(textwrap.fill(line, width, **whole) for line in lines)
 
 
 def verdict(*gains: Sequence[float]) -> str:
