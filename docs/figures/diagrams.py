@@ -15,7 +15,7 @@ GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several routes)?", "PastPrior(8), nfe=3", BLUE),
     ("Are actions absolute joint targets,\nor absolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
-    ("At most 25 scripted demos, and time\nfor only one evaluation per chunk?", "PastPrior(8), nfe=1", BLUE),
+    ("At most 25 scripted demos, and time\nfor NFE 1 only?", "PastPrior(8), nfe=1", BLUE),
 )
 
 

@@ -177,7 +177,7 @@ def table(sets: Sets) -> str:
 
 
 def short_table(sets: Sets) -> str:
-    """Return a line per method in Markdown: its mean at nine evaluations, or all it has, and at one."""
+    """Return a line per method in Markdown: its mean at NFE 9, or at its largest, and at NFE 1."""
     means = standings(sets).set_index(["source", "nfe"])["mean"]
     most = {source: max(n for s, n in means.index if s == source) for source, _ in means.index}
     rates = {source: means[source, nfe] for source, nfe in most.items()}

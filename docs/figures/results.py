@@ -62,7 +62,7 @@ WARM = (PAST, PREVIEW, CORRELATED)
 
 
 def gains() -> DataFrame:
-    """Return success minus the Gaussian source's at one step, in cells and on average over a group."""
+    """Return success minus the Gaussian source's at NFE 1, in cells and on average over a group."""
     differences: dict[tuple[str, str], list[np.ndarray]] = {}
     for group, runs in GROUPS.items():
         cells = read_cells(runs).query("nfe == 1")
@@ -79,9 +79,9 @@ def gains() -> DataFrame:
 
 
 def one_step() -> None:
-    """Draw chart A: gains at one step."""
+    """Draw chart A: gains at NFE 1."""
     frame = gains()
-    picture, (axis,) = figure(WIDTH, 7.5, 1, "Success at one step, minus that of the Gaussian source")
+    picture, (axis,) = figure(WIDTH, 7.5, 1, "Success at NFE 1, minus that of the Gaussian source")
     order = list(dict.fromkeys(frame["setting"]))
     for k, source in enumerate(WARM):
         part, (label, color, mark) = frame[frame["source"] == source], SOURCES[source]
@@ -101,8 +101,8 @@ def one_step() -> None:
 
 
 def steps() -> None:
-    """Draw chart B: success against the number of integration steps."""
-    picture, axes = figure(WIDTH, 8.4, 1, "Success against the number of network evaluations", rows=3)
+    """Draw chart B: success against NFE."""
+    picture, axes = figure(WIDTH, 8.4, 1, "Success against NFE (network evaluations per chunk)", rows=3)
     for axis, (group, runs) in zip(axes, GROUPS.items(), strict=True):
         cells = read_cells(runs)
         lines(axis, cells, "nfe", [1, 2, 3, 9])
