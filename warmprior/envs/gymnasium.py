@@ -175,7 +175,7 @@ def registered_env(
             ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is written under
             ``"success"``; in data also the ``"dataset"``, for errors.
         terminate_on_success: see :func:`gym_env`.
-        horizon: steps per episode, instead of ``"max_episode_steps"``.
+        horizon: time limit in control steps, instead of ``"max_episode_steps"``.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
 
     Raises:

@@ -29,7 +29,7 @@ class Data(Resizing):
         task: task of robosuite, for a LeRobotDataset that does not describe its environment
         style: style of the demonstrations, which decides robosuite's time limit; by default ph, and human
             outside robosuite
-        horizon: control steps per episode; by default the environment's own, or robosuite's for the style
+        horizon: time limit in control steps; by default the environment's own, or robosuite's for the style
         fast_rendering: render robosuite's images without reflections, shadows and smooth edges
     """
 

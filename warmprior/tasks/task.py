@@ -43,8 +43,8 @@ class Play:
             without arguments: a TorchRL environment without batch dimensions, in raw units, with
             ``"observation"`` ``[d_o]`` and ``"action"`` ``[d_a]``, that starts the same episode after every
             ``set_seed(seed)``.
-        horizon: control steps per episode; by default the recorded environment's own, or robosuite's for the
-            style.
+        horizon: time limit in control steps; by default the recorded environment's own, or robosuite's for
+            the style.
         success: the key of a flag of ``make_env``'s environment that is True once the task is solved, bool
             ``[1]``.
         measures: further keys that its episodes report, each with the way in which its values are combined:

@@ -79,7 +79,7 @@ class DataOptions(Resizing):
         download: download the official demonstrations, in place of generated ones
         force_download: download the official demonstrations again, in place of a broken local copy
         mask: mask of the file, such as train, whose demonstrations to use (default: all)
-        horizon: control steps per episode (default: the environment's own, or robosuite's for the style)
+        horizon: time limit in control steps (default: the environment's own, or robosuite's for the style)
         demonstrations: number of demonstrations to generate, or to take from a file, which is taken whole if
             none is given; two numbers for ph and mh
         actions: actions of the policies: deltas as recorded, or the absolute poses that they target
