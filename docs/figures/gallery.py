@@ -29,7 +29,7 @@ def reduce_picture(source: Path, target: Path) -> None:
     # Dithering hides the palette in photographs, but blurs lines on white.
     photograph = source.name.startswith("filmstrip")
     dither = Image.Dither.FLOYDSTEINBERG if photograph else Image.Dither.NONE
-    palette = image.quantize(256, Image.Quantize.MEDIANCUT)
+    palette = image.quantize(256, Image.Quantize.MAXCOVERAGE)  # a small can keeps its red
     reduced = image.quantize(palette=palette, dither=dither)
     colours, paper = reduced.getpalette(), reduced.getpixel((0, 0))
     colours[3 * paper : 3 * paper + 3] = 255, 255, 255  # white, not the mean of nearly white
