@@ -14,7 +14,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from tests.errors import raises
+from tests.errors import missing, raises
 from tests.processes import apart
 from warmprior.data import DatasetError, frames, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
@@ -202,6 +202,41 @@ def test_a_disk_without_space(recorded, read, monkeypatch):
     size = 2 * STEPS * 3 * 16**2
     monkeypatch.setattr(os, "posix_fallocate", lambda *where: (full if where[2] == size else take)(*where))
     read.clear()
-    with raises(OSError, "GB", "recorded.hdf5", str(folder), "WARMPRIOR_CACHE"):
+    with raises(OSError, "GB", "recorded.hdf5", str(folder), "free some space", "WARMPRIOR_CACHE"):
         front(path)
     assert not read and len(list(folder.glob("*.bytes"))) == 1
+
+
+def test_what_fails_in_reading_is_not_the_disk_of_the_cache(recorded, monkeypatch):
+    """A file of a folder that cannot be opened any more, once images are written."""
+    path, images, folder = recorded
+    other, original = path.with_name("second.hdf5"), h5py.File
+    other.write_bytes(path.read_bytes())
+
+    def opened(name, *args, **options):
+        if name == other and list(folder.glob(".*.tmp")):
+            raise OSError(errno.EMFILE, "Unable to open file")
+        return original(name, *args, **options)
+
+    with monkeypatch.context() as patched, raises(OSError, other, "Too many open files") as caught:
+        patched.setattr(h5py, "File", opened)
+        front(path.parent)
+    assert missing(str(caught.value), "space") and missing(str(caught.value), "WARMPRIOR_CACHE")
+    assert torch.equal(front(path.parent), torch.cat([images, images]))
+
+
+@pytest.mark.parametrize("step", ["posix_fallocate", "replace"])
+def test_a_cache_that_fails_otherwise_says_why(recorded, monkeypatch, step):
+    def failing(*args):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    path, _, folder = recorded
+    front(path, image_size=8)  # also the space of numbers is reserved
+    take, size = os.posix_fallocate, 2 * STEPS * 3 * 16**2
+    if step == "posix_fallocate":
+        monkeypatch.setattr(os, step, lambda *where: (failing if where[2] == size else take)(*where))
+    else:
+        monkeypatch.setattr(os, step, failing)
+    with raises(OSError, "GB", "recorded.hdf5", folder, "Input/output error", "WARMPRIOR_CACHE") as caught:
+        front(path)
+    assert missing(str(caught.value), "space")

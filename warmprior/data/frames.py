@@ -18,7 +18,7 @@ from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
-from warmprior.io.files import cache_folder, digest_of, reserve, write_atomic
+from warmprior.io.files import cache_folder, digest_of, reserve, storing, write_atomic
 from warmprior.io.progress import progress_bar
 from warmprior.modules.resize import resized
 
@@ -96,7 +96,9 @@ def cached_images(
             raise DatasetError(f"{index.path} changed while it was read: read it again")
         temporary.chmod(COMPLETE)
 
-    try:
+    needed = f"{torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path}"
+    what, elsewhere = f"{path.parent}: cannot keep {needed}", "another folder (WARMPRIOR_CACHE)"
+    with storing(what, path.parent, elsewhere):
         if not _is_complete(path, shape):
             path.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(path.with_suffix(".lock"), mode=0o666):
@@ -108,11 +110,6 @@ def cached_images(
         images = MemoryMappedTensor.from_filename(path, torch.uint8, shape)
         if not _is_complete(path, shape):
             raise FileNotFoundError(f"{path} was removed meanwhile: read it again")
-    except OSError as error:
-        raise OSError(
-            f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
-            f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
-        ) from error
     return images
 
 
