@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 pytest.importorskip("h5py")
 
@@ -123,16 +124,30 @@ def test_the_second_of_two_processes_waits_for_the_first(recorded, monkeypatch, 
     assert (tmp_path / "log").read_text().split() == ["demo_0", "demo_1"]
 
 
-def test_maps_are_shared_and_never_of_a_file_that_is_gone(recorded, read):
+def test_another_process_maps_the_same_images_or_is_told_that_they_are_gone(recorded, read):
+    """PyTorch would make a file of zeros, and TensorDict send a part of a part as another one."""
     path, images, folder = recorded
     data = front(path)
-    assert torch.equal(pickle.loads(pickle.dumps(data)), images)  # as to a worker process
-    assert len(pickle.dumps(data)) < images.numel()
+    whole = TensorDict({"front": data}, [len(data)])
+    parts = {
+        "whole": (data, images),
+        "part": (data[2:], images[2:]),
+        "part of a part": (data[2:][1:7], images[3:9]),
+        "of steps": (whole[3:][1:]["front"], images[4:]),
+    }
+    for part, expected in parts.values():
+        sent = pickle.dumps(part)
+        received = pickle.loads(sent)
+        assert torch.equal(received, expected) and torch.equal(
+            pickle.loads(pickle.dumps(received[1:])), expected[1:]
+        )
+        assert len(sent) < images[0].numel()
+    sent = [pickle.dumps(part) for part, _ in parts.values()]
     (kept,) = folder.glob("*.bytes")
-    sent = pickle.dumps(data)
     kept.unlink()
-    pickle.loads(sent)  # PyTorch makes a file of zeros
-    assert kept.stat().st_size == images.numel() and not any(kept.read_bytes())
+    for one in sent:
+        with raises(FileNotFoundError, kept, "removed"):
+            pickle.loads(one)
     assert torch.equal(front(path), images) and len(read) == 4
 
 

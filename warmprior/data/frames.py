@@ -10,6 +10,7 @@ from contextlib import suppress
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -107,10 +108,27 @@ def cached_images(
                     _clean(path.parent)
         with suppress(OSError):  # of another user, who shares the folder
             os.utime(path)
-        images = MemoryMappedTensor.from_filename(path, torch.uint8, shape)
-        if not _is_complete(path, shape):
-            raise FileNotFoundError(f"{path} was removed meanwhile: read it again")
-    return images
+        return ImageMap.from_filename(path, torch.uint8, shape)
+
+
+class ImageMap(MemoryMappedTensor):
+    """A map of images or of a part of them, which another process opens as the same rows, or not at all."""
+
+    @classmethod
+    def from_filename(
+        cls, filename: Path, dtype: torch.dtype, shape: Sequence[int], index: Any = None
+    ) -> Any:
+        """Map a file; ``index`` is the sizes, strides and offset of a part."""
+        images = super().from_filename(filename, dtype, shape)
+        if not _is_complete(Path(filename), shape):
+            raise FileNotFoundError(f"{filename} was removed meanwhile: read the demonstrations again")
+        return images if index is None else images._index_wrap(images.as_strided(*index), None)
+
+    def _index_wrap(self, tensor: Tensor, item: Any, check: bool = False) -> Any:
+        part = super()._index_wrap(tensor, item, check)
+        if isinstance(part, MemoryMappedTensor):  # with an index that also holds for a part of a part
+            part.__class__, part.index = type(self), (part.shape, part.stride(), part.storage_offset())
+        return part
 
 
 def _is_complete(path: Path, shape: Sequence[int]) -> bool:
