@@ -154,6 +154,8 @@ class WholePolicy(nn.Module):
                 config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
             if saved.get("type") == cls.name:
                 kept = PreTrainedConfig.from_pretrained(place, **hub)
+                if kept.prior is None:
+                    raise ValueError("its config.json names no prior")
                 for option, unset in (("joints", "auto"), ("prior", None)):
                     if getattr(config, option, "") == unset:  # what the weights were trained with
                         setattr(config, option, getattr(kept, option))
