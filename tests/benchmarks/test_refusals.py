@@ -34,6 +34,9 @@ def no_work(monkeypatch):
     [
         ("robomimic", "--nfe 0", ("--nfe", "0")),
         ("robomimic", "--device cuda:99", ("device cuda:99",)),
+        ("robomimic", "--task x", ("--task x", "lift, can")),
+        ("robomimic", "--temperature 1 -0.5", ("--temperature -0.5", ">= 0")),
+        ("robomimic", "--grid odd", ("--grid odd", "dense-jump")),
         ("robomimic", f"{FILE} --task can", ("demonstrations of lift", "can")),
         ("robomimic", f"{FILE} --demonstrations 2 3", ("--demonstrations", "--dataset")),
         ("robomimic", "--prior ot --batch-size 1", ("ot", "batch")),

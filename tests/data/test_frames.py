@@ -9,12 +9,13 @@ import time
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 pytest.importorskip("h5py")
 
 import h5py
 
-from tests.errors import raises
+from tests.errors import missing, raises
 from tests.processes import apart
 from warmprior.data import DatasetError, frames, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
@@ -123,16 +124,30 @@ def test_the_second_of_two_processes_waits_for_the_first(recorded, monkeypatch, 
     assert (tmp_path / "log").read_text().split() == ["demo_0", "demo_1"]
 
 
-def test_maps_are_shared_and_never_of_a_file_that_is_gone(recorded, read):
+def test_another_process_maps_the_same_images_or_is_told_that_they_are_gone(recorded, read):
+    """PyTorch would make a file of zeros, and TensorDict send a part of a part as another one."""
     path, images, folder = recorded
     data = front(path)
-    assert torch.equal(pickle.loads(pickle.dumps(data)), images)  # as to a worker process
-    assert len(pickle.dumps(data)) < images.numel()
+    whole = TensorDict({"front": data}, [len(data)])
+    parts = {
+        "whole": (data, images),
+        "part": (data[2:], images[2:]),
+        "part of a part": (data[2:][1:7], images[3:9]),
+        "of steps": (whole[3:][1:]["front"], images[4:]),
+    }
+    for part, expected in parts.values():
+        sent = pickle.dumps(part)
+        received = pickle.loads(sent)
+        assert torch.equal(received, expected) and torch.equal(
+            pickle.loads(pickle.dumps(received[1:])), expected[1:]
+        )
+        assert len(sent) < images[0].numel()
+    sent = [pickle.dumps(part) for part, _ in parts.values()]
     (kept,) = folder.glob("*.bytes")
-    sent = pickle.dumps(data)
     kept.unlink()
-    pickle.loads(sent)  # PyTorch makes a file of zeros
-    assert kept.stat().st_size == images.numel() and not any(kept.read_bytes())
+    for one in sent:
+        with raises(FileNotFoundError, kept, "removed"):
+            pickle.loads(one)
     assert torch.equal(front(path), images) and len(read) == 4
 
 
@@ -202,6 +217,41 @@ def test_a_disk_without_space(recorded, read, monkeypatch):
     size = 2 * STEPS * 3 * 16**2
     monkeypatch.setattr(os, "posix_fallocate", lambda *where: (full if where[2] == size else take)(*where))
     read.clear()
-    with raises(OSError, "GB", "recorded.hdf5", str(folder), "WARMPRIOR_CACHE"):
+    with raises(OSError, "GB", "recorded.hdf5", str(folder), "free some space", "WARMPRIOR_CACHE"):
         front(path)
     assert not read and len(list(folder.glob("*.bytes"))) == 1
+
+
+def test_what_fails_in_reading_is_not_the_disk_of_the_cache(recorded, monkeypatch):
+    """A file of a folder that cannot be opened any more, once images are written."""
+    path, images, folder = recorded
+    other, original = path.with_name("second.hdf5"), h5py.File
+    other.write_bytes(path.read_bytes())
+
+    def opened(name, *args, **options):
+        if name == other and list(folder.glob(".*.tmp")):
+            raise OSError(errno.EMFILE, "Unable to open file")
+        return original(name, *args, **options)
+
+    with monkeypatch.context() as patched, raises(OSError, other, "Too many open files") as caught:
+        patched.setattr(h5py, "File", opened)
+        front(path.parent)
+    assert missing(str(caught.value), "space") and missing(str(caught.value), "WARMPRIOR_CACHE")
+    assert torch.equal(front(path.parent), torch.cat([images, images]))
+
+
+@pytest.mark.parametrize("step", ["posix_fallocate", "replace"])
+def test_a_cache_that_fails_otherwise_says_why(recorded, monkeypatch, step):
+    def failing(*args):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    path, _, folder = recorded
+    front(path, image_size=8)  # also the space of numbers is reserved
+    take, size = os.posix_fallocate, 2 * STEPS * 3 * 16**2
+    if step == "posix_fallocate":
+        monkeypatch.setattr(os, step, lambda *where: (failing if where[2] == size else take)(*where))
+    else:
+        monkeypatch.setattr(os, step, failing)
+    with raises(OSError, "GB", "recorded.hdf5", folder, "Input/output error", "WARMPRIOR_CACHE") as caught:
+        front(path)
+    assert missing(str(caught.value), "space")

@@ -1,3 +1,4 @@
+import errno
 import multiprocessing
 import os
 import signal
@@ -5,9 +6,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import pytest
 import torch
 
-from tests.errors import raises, refuses
+from tests.errors import missing, raises, refuses
 from warmprior.io.files import check_writable, exclusive, read_json, read_tensors, save_file, write_atomic
 
 FORK = multiprocessing.get_context("fork")
@@ -85,3 +87,26 @@ def test_files_and_folders_that_cannot_be_used_are_named(tmp_path):
         path.write_bytes(content)
         refuses(lambda: read_json(path), ValueError, path, "JSON")
     refuses(lambda: check_writable(path), OSError, path)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EMFILE, errno.EIO])
+def test_only_a_lack_of_space_is_called_so(tmp_path, monkeypatch, code):
+    """Whatever else the system says is the reason; of files elsewhere, it is not the writing that failed."""
+    path, reason = tmp_path / "new" / "file", os.strerror(code)
+
+    def failing(*args):
+        raise OSError(code, reason)
+
+    full = code in (errno.ENOSPC, errno.EDQUOT)
+    for call in (lambda: write_atomic(path, failing), lambda: check_writable(path.parent)):
+        with raises(OSError, path.parent, reason) as caught:
+            call()
+        assert (not missing(str(caught.value), "space", "free")) == full
+        monkeypatch.setattr(os, "fsync", failing)
+
+    def reading(temporary):
+        raise OSError(code, reason, str(tmp_path / "data" / "one.hdf5"))
+
+    with raises(OSError, "one.hdf5", reason) as caught:
+        write_atomic(path, reading)
+    assert caught.value.errno == code and missing(str(caught.value), path)

@@ -1,10 +1,11 @@
 import json
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import numbers, write_lerobot
+from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
 from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
@@ -17,9 +18,11 @@ from warmprior import (
     VelocityMLP,
     keys,
 )
+from warmprior.__main__ import main
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.history import cold_history
 from warmprior.modules.resize import resized
+from warmprior.saving import load_policy
 from warmprior.training import precondition
 
 pytestmark = NEEDS_PLUGIN
@@ -415,6 +418,34 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
         one.reset()
         chunks.append(one.predict_action_chunk(dict(batch)))
     assert torch.equal(*chunks)
+
+
+@pytest.mark.parametrize(("near", "prior"), [(True, "gaussian"), (False, "past,correlation=0.5")])
+def test_the_default_source_is_that_of_train(found, tmp_path, near, prior, capsys, caplog):
+    """The data decide, after LeRobot asked which steps to load."""
+    root = tmp_path / "data"
+    joint_dataset(root, near=near)
+    (file,) = root.glob("data/*/*.parquet")  # train refuses a state that is the action
+    edit_table(file, observation__state=lambda rows: [np.float32(row) - np.float32(0.01) for row in rows])
+    loaded = found["warm_flow"].config_class(n_action_steps=4).action_delta_indices
+    caplog.set_level("INFO")
+    policy, _ = dataset_policy(found, root, n_action_steps=4)
+    assert caplog.messages[-1].endswith(f"{prior} (--policy.prior)")
+    assert policy.config.action_delta_indices == loaded == list(range(-4, 4))
+    words = f"train lerobot:{root} --out {tmp_path} --chunk 4 --iterations 1 --hidden-dim 8 --held-out 0"
+    assert main(words.split()) == 0
+    trained = load_policy(capsys.readouterr().out.splitlines()[-1])
+    assert policy.actor.prior.config() == trained.prior.config()
+    policy.save_pretrained(tmp_path / "policy")
+    assert json.loads((tmp_path / "policy/config.json").read_text())["prior"] == prior
+
+
+def test_a_saved_source_stays_where_the_options_name_none(found, tmp_path):
+    policy, usual = flow_policy(found, prior="preview"), flow_policy(found).config
+    policy.save_pretrained(tmp_path)
+    usual.prior = None
+    again = found["warm_flow"].from_pretrained(tmp_path, config=usual)
+    assert again.actor.prior.config() == policy.actor.prior.config()
 
 
 def test_joint_targets_need_joints_in_the_units_that_they_were_fitted_in(found, tmp_path, caplog):

@@ -10,6 +10,7 @@ from contextlib import suppress
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
-from warmprior.io.files import cache_folder, digest_of, reserve, write_atomic
+from warmprior.io.files import cache_folder, digest_of, reserve, storing, write_atomic
 from warmprior.io.progress import progress_bar
 from warmprior.modules.resize import resized
 
@@ -96,7 +97,9 @@ def cached_images(
             raise DatasetError(f"{index.path} changed while it was read: read it again")
         temporary.chmod(COMPLETE)
 
-    try:
+    needed = f"{torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path}"
+    what, elsewhere = f"{path.parent}: cannot keep {needed}", "another folder (WARMPRIOR_CACHE)"
+    with storing(what, path.parent, elsewhere):
         if not _is_complete(path, shape):
             path.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(path.with_suffix(".lock"), mode=0o666):
@@ -105,15 +108,27 @@ def cached_images(
                     _clean(path.parent)
         with suppress(OSError):  # of another user, who shares the folder
             os.utime(path)
-        images = MemoryMappedTensor.from_filename(path, torch.uint8, shape)
-        if not _is_complete(path, shape):
-            raise FileNotFoundError(f"{path} was removed meanwhile: read it again")
-    except OSError as error:
-        raise OSError(
-            f"{path.parent}: cannot keep {torch.Size(shape).numel() / 1e9:.3g} GB of images of {index.path} "
-            f"({error}): free some space, or choose another folder (WARMPRIOR_CACHE)"
-        ) from error
-    return images
+        return ImageMap.from_filename(path, torch.uint8, shape)
+
+
+class ImageMap(MemoryMappedTensor):
+    """A map of images or of a part of them, which another process opens as the same rows, or not at all."""
+
+    @classmethod
+    def from_filename(
+        cls, filename: Path, dtype: torch.dtype, shape: Sequence[int], index: Any = None
+    ) -> Any:
+        """Map a file; ``index`` is the sizes, strides and offset of a part."""
+        images = super().from_filename(filename, dtype, shape)
+        if not _is_complete(Path(filename), shape):
+            raise FileNotFoundError(f"{filename} was removed meanwhile: read the demonstrations again")
+        return images if index is None else images._index_wrap(images.as_strided(*index), None)
+
+    def _index_wrap(self, tensor: Tensor, item: Any, check: bool = False) -> Any:
+        part = super()._index_wrap(tensor, item, check)
+        if isinstance(part, MemoryMappedTensor):  # with an index that also holds for a part of a part
+            part.__class__, part.index = type(self), (part.shape, part.stride(), part.storage_offset())
+        return part
 
 
 def _is_complete(path: Path, shape: Sequence[int]) -> bool:

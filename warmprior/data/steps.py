@@ -30,7 +30,7 @@ from warmprior.data.index import (
 )
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
-from warmprior.io.files import reserve
+from warmprior.io.files import reserve, storing
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
@@ -146,23 +146,22 @@ def _allocate(
                 "are free: use storage='memmap' or fewer demos"
             )
         return torch.empty_like(data)
-    try:
-        if scratch_dir is not None:
-            Path(scratch_dir).mkdir(parents=True, exist_ok=True)
+    place = Path(tempfile.gettempdir() if scratch_dir is None else scratch_dir)
+    what, elsewhere = (
+        f"{place}: cannot store {needed / 1e9:.3g} GB for {index.path}",
+        "another scratch_dir (TMPDIR)",
+    )
+    with storing(what, place, elsewhere):
+        place.mkdir(parents=True, exist_ok=True)
         # A folder of its own, because another reader may use the same one. It is removed by this process
         # alone, also where the end of a worker process calls no other finalizers.
-        folder = tempfile.mkdtemp(dir=scratch_dir)
+        folder = tempfile.mkdtemp(dir=place)
         data = data.memmap_like(folder)
         mapped: list[str] = []
         for value in data.values(True, True):
             mapped.append(value.filename)
             Finalize(value.untyped_storage(), _release, (folder, mapped), exitpriority=0)
             reserve(value)
-    except OSError as error:
-        raise OSError(
-            f"{scratch_dir or 'the folder of temporary files'}: cannot store {needed / 1e9:.3g} GB for "
-            f"{index.path} ({error}): free some space, or choose another scratch_dir (TMPDIR)"
-        ) from error
     return data
 
 

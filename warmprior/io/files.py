@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -110,11 +111,45 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
 
 
+class StorageError(OSError):
+    """Something cannot be stored; the cause is the system's own error."""
+
+
+@contextlib.contextmanager
+def storing(what: str, folder: Path, elsewhere: str = "another folder") -> Iterator[None]:
+    """Let errors of the system in a folder, or above it, say what cannot be stored there and why.
+
+    Other errors pass: those of files elsewhere, which are read meanwhile, and sentences of this library. Of
+    blocks inside each other, the outer one's words are kept.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from warmprior.io.files import storing
+        >>> with storing("cannot keep images", Path("cache"), "another cache"):
+        ...     raise PermissionError(13, "Permission denied", "cache/images")
+        Traceback (most recent call last):
+            ...
+        warmprior.io.files.StorageError: cannot keep images ([Errno 13] ...): choose another cache
+    """
+    try:
+        yield
+    except OSError as error:
+        reason: Any = error.__cause__ if isinstance(error, StorageError) else error
+        inside = True
+        if reason.filename is not None:  # none is named where a write or a reservation fails
+            named, here = (Path(os.path.abspath(path)) for path in (reason.filename, folder))
+            inside = named.is_relative_to(here) or here.is_relative_to(named)
+        if reason.errno is None or not inside:
+            raise
+        advice = "free some space, or choose" if reason.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
+        raise StorageError(f"{what} ({reason}): {advice} {elsewhere}") from reason
+
+
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
     A reader, or a process killed at any moment, sees the old file or the new one, never a part. The folder is
-    created if needed. An ``OSError`` names ``path`` if it cannot be written.
+    created if needed. An ``OSError`` names ``path`` if it cannot be written; others of ``write`` pass.
 
     Examples:
         >>> from pathlib import Path
@@ -130,14 +165,13 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     owner = f"{os.getpid()}.{uuid.uuid4().hex}.{platform.node()}"
     temporary = path.with_name(f".{path.name}.{owner}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_stale(path)
-        write(temporary)
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OSError(f"cannot write {path}: {error}; free space or choose another folder") from error
+        with storing(f"cannot write {path}", path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _remove_stale(path)
+            write(temporary)
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):  # a read-only folder never received the file
             temporary.unlink(missing_ok=True)
@@ -161,14 +195,12 @@ def _remove_stale(path: Path) -> None:
 
 def check_writable(directory: Path) -> None:
     """Create a folder and prove that files can be written there, or raise an ``OSError`` that names it."""
-    try:
+    with storing(f"cannot write to {directory}", directory):
         directory.mkdir(parents=True, exist_ok=True)
         # Without a name, where the system can: others may be trying the same folder.
         with tempfile.TemporaryFile(dir=directory) as probe:
             probe.write(b"ok")
             os.fsync(probe.fileno())
-    except OSError as error:
-        raise OSError(f"cannot write to {directory}: {error}; free space or choose another folder") from error
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ DEFAULT_PRIOR = "past,correlation=0.5"
 """The source of ``train`` and of the plugin, with its options, unless actions are absolute targets."""
 
 PRIOR_OF_TARGETS = "gaussian"
-"""The source of ``train`` for absolute targets, which the plugin advises."""
+"""The source of ``train`` and of the plugin for absolute targets; it needs the same steps."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,6 +35,15 @@ def check_counts(options: Any, *names: str) -> None:
                 check_whole_numbers(**{option: count})
                 if count > MOST:
                     raise ValueError(f"{option} must be at most {MOST:,}, got {count}")
+
+
+@contextmanager
+def naming(option: str, value: Any) -> Iterator[None]:
+    """Let a ValueError of the library, which knows no options of scripts, name the option and its value."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{option} {value}: {error}") from error
 
 
 def check_place(place: str | Path, option: str) -> None:
@@ -165,7 +176,8 @@ class DataOptions(Resizing):
                 f"a task of your own has one style: name one --style, got {' '.join(self.style)}"
             )
         for task in filter(is_simulated, self.task):
-            get_task(task)
+            with naming("--task", task):
+                get_task(task)
             if self.generated and task not in EXPERTS:
                 raise ValueError(
                     f"there is no scripted expert for {task}: add --download for the official data, or "

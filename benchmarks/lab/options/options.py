@@ -19,6 +19,7 @@ from lab.demonstrations.data_options import (
     check_network,
     check_place,
     is_simulated,
+    naming,
     without_images,
 )
 from warmprior.io.distributed import check_batch, launched
@@ -91,8 +92,11 @@ class Evaluation:
         """Raise ValueError for temperatures or a grid that policies do not take."""
         from warmprior.modules.ode import Sampling
 
+        with naming("--grid", self.grid):
+            Sampling(grid=self.grid)
         for temperature in self.temperature:
-            Sampling(temperature=temperature, grid=self.grid)
+            with naming("--temperature", temperature):
+                Sampling(temperature=temperature)
 
     def starts(self, training_seed: int) -> range:
         """Return the simulator seeds of the episodes that policies of a training seed play.
@@ -189,12 +193,10 @@ class Options:
         self.data.check()
         self.evaluation.check()
         check_network(self.network, self.data)
-        check_batch(self.training.batch_size)
-        try:
-            with torch.device("meta"):  # nothing is computed
-                make_network(without_images(self.network), 1, 1, 2)
-        except ValueError as error:
-            raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
+        with naming("--batch-size", self.training.batch_size):
+            check_batch(self.training.batch_size)
+        with naming("--hidden-dim", self.network.hidden_dim), torch.device("meta"):  # nothing is computed
+            make_network(without_images(self.network), 1, 1, 2)
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):
             raise ValueError(
                 "--actions absolute is for robosuite's tasks, and a task of your own has its own: add "

@@ -19,7 +19,7 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
-from warmprior.options.train_command import DEFAULT_PRIOR
+from warmprior.options.train_command import DEFAULT_PRIOR, PRIOR_OF_TARGETS
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 
@@ -48,7 +48,9 @@ class WarmFlowConfig(PreTrainedConfig):
         n_obs_steps: ``To``, observations per decision.
         n_action_steps: actions executed per decision, at most ``H``.
         prior_chunk: ``H``, actions that the prior remembers; by default ``n_action_steps``.
-        prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
+        prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``; by
+            default ``past,correlation=0.5``, or ``gaussian`` if actions are absolute targets. Training writes
+            what it chose.
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
         precondition: precondition the network by the moments of source and data, see PreconditionedNetwork.
@@ -72,7 +74,7 @@ class WarmFlowConfig(PreTrainedConfig):
     n_obs_steps: int = 2
     n_action_steps: int = 8
     prior_chunk: int | None = None
-    prior: str = DEFAULT_PRIOR
+    prior: str | None = None
     cold_probability: float = 0.0
     nfe: int = DEFAULT_NFE
     precondition: bool = True
@@ -105,11 +107,16 @@ class WarmFlowConfig(PreTrainedConfig):
         if self.prior_chunk is None:  # saved as well, so that fewer actions can be executed later
             self.prior_chunk = self.n_action_steps
 
+    @property
+    def source(self) -> str:
+        """Return the name of the prior with its options, given what is known of the actions so far."""
+        # LeRobot asks which steps to load before it shows the data: both defaults need the same ones.
+        return self.prior or (DEFAULT_PRIOR if self.joints in ("", "auto") else PRIOR_OF_TARGETS)
+
     def make_prior(self) -> Prior:
         """Make the source; a ``ValueError`` if the name or an option is unknown."""
-        return build(
-            registered(Prior, self.prior.partition(",")[0], OWN_PRIORS), self.prior, self.prior_chunk
-        )
+        kind = registered(Prior, self.source.partition(",")[0], OWN_PRIORS)
+        return build(kind, self.source, self.prior_chunk)
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""

@@ -154,8 +154,11 @@ class WholePolicy(nn.Module):
                 config = PreTrainedConfig.from_pretrained(place, cli_overrides=list(cli_overrides), **hub)
             if saved.get("type") == cls.name:
                 kept = PreTrainedConfig.from_pretrained(place, **hub)
-                if getattr(config, "joints", None) == "auto":  # what the weights were trained with
-                    config.joints = kept.joints
+                if kept.prior is None:
+                    raise ValueError("its config.json names no prior")
+                for option, unset in (("joints", "auto"), ("prior", None)):
+                    if getattr(config, option, "") == unset:  # what the weights were trained with
+                        setattr(config, option, getattr(kept, option))
                 check_options(kept, config, training=kwargs.get("dataset_meta") is not None)
             # A training that goes on reads its dataset while the policy is built.
             limited = cls.has_all_weights and weights and kwargs.get("dataset_meta") is None

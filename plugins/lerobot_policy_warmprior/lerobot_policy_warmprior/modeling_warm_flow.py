@@ -45,7 +45,6 @@ from warmprior.lerobot.names import named_joints
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.modules.resize import resized
-from warmprior.options.train_command import PRIOR_OF_TARGETS
 from warmprior.training import ema_of, precondition
 
 
@@ -147,10 +146,12 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         if encoder is not None:
             network = VisionNetwork(encoder, network)
         if config.precondition and not preconditioned:
-            network = self._preconditioned(network, prior, dataset_meta)
-        if dataset_meta is not None:  # the preconditioning recognises the joints
+            network = self._preconditioned(network, dataset_meta)
+        config.prior = config.source  # the preconditioning recognised absolute targets, if there are any
+        prior = config.make_prior()
+        if dataset_meta is not None:
             used = recording_of(config, dataset_meta, training_episodes(dataset_meta))
-            logging.info("%s", used.text("--policy.{}"))
+            logging.info("%s\n%-13s %s (--policy.prior)", used.text("--policy.{}"), "source", config.prior)
         # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
         # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
@@ -170,15 +171,13 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         self.__dict__["_loss_of_actor"] = None
         self.reset()
 
-    def _preconditioned(
-        self, network: VelocityNetwork, prior: Prior, dataset_meta: Any
-    ) -> PreconditionedNetwork:
+    def _preconditioned(self, network: VelocityNetwork, dataset_meta: Any) -> PreconditionedNetwork:
         """Precondition the network by the moments of source and data; a saved policy's are in its file."""
         key, trend = self.config.joints, None
         if dataset_meta is None:
             if key not in ("", "auto"):
                 resting = RestingJoints(self.config.joint_columns(key))
-                trend = RestingTrend.zero(resting.config(), prior.prediction_length)
+                trend = RestingTrend.zero(resting.config(), network.prediction_length)
             return PreconditionedNetwork(network, trend=trend)
         mode = self.config.normalization_mapping.get("ACTION")
         if mode != NormalizationMode.MIN_MAX:
@@ -209,7 +208,8 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         vectors = [normalised[TransitionKey.OBSERVATION][name] for name in self.config.observed]
         steps[keys.OBSERVATION] = torch.cat(vectors, -1)
         rest = self._resting_joints(steps, dataset_meta)
-        return precondition(network, steps, prior, withhold=self.config.cold_probability, rest=rest)
+        prior, withhold = self.config.make_prior(), self.config.cold_probability
+        return precondition(network, steps, prior, withhold=withhold, rest=rest)
 
     def _resting_joints(self, steps: TensorDictBase, dataset_meta: Any) -> RestingJoints | None:
         """Return the resting action of absolute joint targets, and write their key into the configuration."""
@@ -237,9 +237,6 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             worst = rest.farthest(steps[keys.OBSERVATION], steps[keys.ACTION])
             if worst is None:
                 config.joints = key
-                best = PRIOR_OF_TARGETS
-                advice = "" if config.prior == best else f"; --policy.prior={best} suits them best"
-                logging.info("the actions are absolute targets of %s: joints=%s%s", key, key, advice)
                 return rest
             if asked != "auto":
                 raise ValueError(

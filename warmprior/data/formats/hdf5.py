@@ -7,6 +7,7 @@ reads as zeros. Everything here is opened by :func:`member`, which refuses both.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import pairwise, product
@@ -170,9 +171,9 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             f"{path}: another process has it open to write ({error}): close it there, or wait; on a file "
             "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
         ) from error
-    except PermissionError:
-        raise PermissionError(f"{path}: no permission to read it: change its permissions") from None
     except OSError as error:
+        if error.errno is not None:  # the system's reason, not the format's
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
         size = path.stat().st_size
         raise DatasetError(f"{path}: not a readable HDF5 file ({size} bytes; {error}). {_AGAIN}") from error
     with file:
