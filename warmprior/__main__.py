@@ -217,6 +217,7 @@ def improve(
     steps: int = 100_000,
     algorithm: Algorithm = "dsrl-na",
     delta: float | None = None,
+    residual_length: int | None = None,
     nfe: int | None = None,
     num_envs: int = 4,
     compile: bool = False,
@@ -234,6 +235,7 @@ def improve(
         steps: control steps to learn from
         algorithm: algorithm of the agent
         delta: half the side of the agent's box; by default 0.5 around a warm mean, and 1.5 around zero
+        residual_length: residuals per chunk, each held for several actions; by default one per action
         nfe: network evaluations per chunk; by default the policy's
         num_envs: simulators in worker processes
         compile: compile the agent's updates, for twice the speed; needs a C++ compiler
@@ -257,6 +259,7 @@ def improve(
         evaluate_every=max(1, steps // 10),
         nfe=actor.sampling.evaluations(nfe),
         delta=delta,
+        residual_length=residual_length,
         seed=seed,
     )
     print(

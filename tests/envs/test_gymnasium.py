@@ -8,7 +8,7 @@ import numpy as np
 from torchrl.envs import SerialEnv
 
 from tests.errors import raises, refuses
-from warmprior.envs.gymnasium import gym_env
+from warmprior.envs.gymnasium import gym_env, registered_env
 
 
 class Dial(gymnasium.Env):
@@ -162,3 +162,31 @@ def test_every_seed_is_one_reset_and_later_episodes_are_others():
     again = env.reset()["observation"]
     assert base.resets[before:] == [3, None] and again.tolist() != first[0][0]
     assert played(env, 3) == first  # whatever was played before
+
+
+def registered_dial(monkeypatch):
+    """Register a dial for a test; return the description of its environment, whose own reward is 1."""
+    gymnasium.register("Dial-v0", Dial)
+    monkeypatch.setitem(gymnasium.registry, "Dial-v0", gymnasium.registry.pop("Dial-v0"))
+    return {"id": "Dial-v0", "max_episode_steps": 4, "success": "solved"}
+
+
+def test_a_registered_environment_numbers_its_episodes_if_asked(monkeypatch):
+    env = registered_env(registered_dial(monkeypatch), seed_offset=1, seed_stride=3)
+    resets = env.base_env._env.unwrapped.resets
+    before = len(resets)
+    env.set_seed(10)
+    for _ in range(3):
+        env.reset()
+    assert resets[before:] == [11, 14, 17]
+
+
+def test_a_sparse_reward_is_success(monkeypatch):
+    described = registered_dial(monkeypatch)
+    env = registered_env(described, sparse_reward=True, terminate_on_success=False)
+    env.set_seed(1)
+    after = torch.cat([env.rollout(4, break_when_any_done=False)["next"] for _ in range(4)])
+    assert after["reward"].tolist() == after["success"].float().tolist()
+    assert 0 < after["reward"].sum() < len(after)
+    with raises(ValueError, "Dial-v0", "make_env"):
+        registered_env({**described, "success": None}, sparse_reward=True)

@@ -1,18 +1,24 @@
 """A saved policy is improved, the better policy is kept, and nothing is lost at an interruption."""
 
+import json
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
+from torchrl.envs import SerialEnv
 
+from tests.envs.test_gymnasium import registered_dial
 from tests.errors import raises
 from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
 from tests.states import same
+from tests.toy_env import mlp_actor
 from warmprior import GaussianPrior, PastPrior, RealTimeChunking, policy_transforms
-from warmprior.envs.description import registered_description
+from warmprior.envs.description import environment_of, registered_description
 from warmprior.evaluation import evaluate, parallel_env
+from warmprior.io.workers import start_method
 from warmprior.rl import improve, improve_policy, improved_policy
 from warmprior.saving import load_policy, save_policy
+from warmprior.saving.checkpoint import load_state
 
 
 class ReachEnv(SolvableEnv):
@@ -121,15 +127,33 @@ def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monk
     assert len({*seeds[:2]}) == 1 and seeds[2] == 10_000_000 and seeds[0] > 10_000_000 + 4
 
 
+@pytest.mark.skipif(start_method() == "spawn", reason="workers do not know what a test registers")
+def test_a_policy_of_gymnasium_is_improved_by_its_success(tmp_path, monkeypatch):
+    """Played beside the library's numbers of episodes: environments that are seeded one by one."""
+    dial = registered_dial(monkeypatch)
+    described = registered_description({**dial, "kwargs": {}, "observation_keys": []})
+    actor = mlp_actor(GaussianPrior(H), 1, 2, 1, nfe=2, clip=1.0, environment=described)
+    config = make_config(environment_steps=60)
+    result = improve_policy(actor, tmp_path, num_envs=2, config=config, episodes=4, description=None)
+    single = partial(environment_of, actor)
+    env = SerialEnv(2, [single, single])
+    for policy, solved in ((actor, result.before), (result.policy, result.after)):
+        played = evaluate(policy, env, episodes=4, first_seed=10_000_000)
+        assert sum(episode.success for episode in played) == solved
+    stored, _ = load_state(tmp_path / "buffer" / "000000.safetensors", "transitions", "")
+    reward, executed = (stored[json.dumps(["next", name])] for name in ("reward", "executed_steps"))
+    assert set((reward + executed).flatten().tolist()) == {0.0, 1.0}  # the dial's own rewards are 1 a step
+
+
 def test_a_policy_without_an_environment_is_refused(tmp_path):
     with raises(ValueError, "keeps no description"):
         improve_policy(make_actor(), tmp_path)
     with raises(ValueError, "make_transforms"):
         improve_policy(make_actor(), tmp_path, make_env=make_env)
-    registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": "is_success"}
-    description = registered_description({**registered, "observation_keys": ["observation"]})
     with raises(ValueError, "guidance=None"):
         improve_policy(make_actor().replace(guidance=RealTimeChunking(horizon=2)), tmp_path)
-    with raises(ValueError, "Gymnasium", "make_env"):
-        improve_policy(make_actor().replace(environment=description), tmp_path)
+    registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": None}
+    described = registered_description({**registered, "observation_keys": ["observation"]})
+    with raises(ValueError, "Pendulum-v1", "make_env"):
+        improve_policy(make_actor().replace(environment=described), tmp_path)
     assert not list(tmp_path.iterdir())

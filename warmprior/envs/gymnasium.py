@@ -54,9 +54,15 @@ class _Gym(GymWrapper):
     _next: int | None = None
     ends_at: str | None = None
     """The flag in ``info`` that ends the episode."""
+    rewards: str | None = None
+    """The flag in ``info`` that is the reward, in place of the environment's own."""
+    seed_offset, seed_stride = 0, None
+    """See :func:`registered_env`."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         result = super()._step(tensordict)
+        if self.rewards is not None:
+            result.set("reward", result[self.rewards].to(result["reward"].dtype))
         if self.ends_at is not None and result[self.ends_at].any():
             for flag in ("terminated", "done"):
                 result.set(flag, torch.ones_like(result[flag]))
@@ -79,11 +85,12 @@ class _Gym(GymWrapper):
         return self
 
     def _set_seed(self, seed: int | None) -> None:
-        self._next = seed
+        self._next = None if seed is None else seed + self.seed_offset
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if self._next is not None:
-            kwargs["seed"], self._next = self._next, None
+            kwargs["seed"] = self._next
+            self._next = None if self.seed_stride is None else self._next + self.seed_stride
         return super()._reset(tensordict, **kwargs)
 
 
@@ -162,7 +169,10 @@ def registered_env(
     description: Mapping[str, Any],
     *,
     terminate_on_success: bool = True,
+    sparse_reward: bool = False,
     horizon: int | None = None,
+    seed_offset: int = 0,
+    seed_stride: int | None = None,
     render_mode: str | None = None,
 ) -> TransformedEnv:
     """Build an environment of Gymnasium's registry from a description in data or a policy.
@@ -175,13 +185,18 @@ def registered_env(
             ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is written under
             ``"success"``; in data also the ``"dataset"``, for errors.
         terminate_on_success: see :func:`gym_env`.
+        sparse_reward: True rewards a step with 1 if the task is solved and with 0 otherwise, in place of the
+            environment's own reward.
         horizon: time limit in control steps, instead of ``"max_episode_steps"``.
+        seed_offset: offset added to every seed.
+        seed_stride: episode ``n`` after ``set_seed(seed)`` starts with ``seed + seed_offset + n *
+            seed_stride``, as in :class:`RobosuiteEnv`; by default only the first follows from a seed.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
 
     Raises:
         ImportError: if no environment with this name is registered.
-        ValueError: if the description has wrappers, which would be imported, or the environment cannot be
-            built as it says.
+        ValueError: if the description has wrappers, which would be imported, the environment cannot be built
+            as it says, or it needs a success for a sparse reward.
 
     Examples:
         >>> from warmprior.envs import registered_env
@@ -224,7 +239,12 @@ def registered_env(
         warnings.warn(f"{name} has no time limit: episodes may never end without a horizon", stacklevel=2)
     success = description.get("success")
     chosen = description.get("observation_keys") or ()
+    if sparse_reward and success is None:
+        raise ValueError(f"nothing in info says when {name} is solved: give a make_env that rewards success")
     made = gym_env(env, success=success, observation_keys=chosen, terminate_on_success=terminate_on_success)
+    base: Any = made.base_env
+    base.rewards = success if sparse_reward else None
+    base.seed_offset, base.seed_stride = seed_offset, seed_stride
     if success not in (None, SUCCESS):
         made.append_transform(RenameTransform([success], [SUCCESS]))
     return made

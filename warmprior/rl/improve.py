@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def improve_policy(
 
     Keyword Args:
         make_env: builds the environment, called as for :func:`~warmprior.evaluation.parallel_env`; by default
-            the environment that the policy was made for.
+            the environment that the policy was made for, rewarded by its success.
         make_transforms: builds the policy's transforms for ``make_env``.
         num_envs: environments in worker processes.
         config: the recipe; by default :data:`~warmprior.rl.improve.SMALL`, at the policy's own number of
@@ -103,8 +104,9 @@ def improve_policy(
         description: label of the progress bars; none if ``None``.
 
     Raises:
-        ValueError: if the policy keeps no description of a robosuite environment and ``make_env`` is missing,
-            the policy is guided, is trained at ``t = 0`` only or sees images, or the recipe does not fit it.
+        ValueError: if the policy keeps no description of an environment with a success and ``make_env`` is
+            missing, the policy is guided, is trained at ``t = 0`` only or sees images, or the recipe does not
+            fit it.
         FloatingPointError: if the training diverges; the last save stays.
 
     Examples:
@@ -132,13 +134,11 @@ def improve_policy(
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     check_improvable(policy)
-    if make_env is None and is_registered(policy.environment):
-        raise ValueError(
-            "the policy's environment is Gymnasium's, whose episodes have no numbers and whose reward may be "
-            "another than success: pass make_env, which builds one that has both"
-        )
     if make_env is None:
         make_env, make_transforms = environment_parts(policy)
+        if is_registered(policy.environment):
+            make_env = partial(make_env, sparse_reward=True)  # its own may be another than success
+            make_env().close()  # an error is better raised here than in a worker
     elif make_transforms is None:
         raise ValueError("make_env needs make_transforms, such as partial(policy_transforms, policy)")
     builders = make_env, make_transforms
