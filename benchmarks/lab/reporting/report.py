@@ -24,7 +24,7 @@ from lab.options.options import Options, with_parts
 from lab.options.presets import IMAGES
 from lab.reporting.columns import COLUMNS, IDENTITY, column
 from lab.reporting.paper import PAPER_SUCCESS, paper_success
-from lab.reporting.rows import read_rows
+from lab.reporting.rows import RESULTS, read_rows
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
 
@@ -458,9 +458,9 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         ...     policy_results(folder, "policies/lift-ph/policy_000020")[0]["success_rate"]
         0.5
     """
-    path, folder = Path(run) / "results.jsonl", Path(policy).resolve()
+    path, folder = Path(run) / RESULTS, Path(policy).resolve()
     if not path.is_file():
-        raise FileNotFoundError(f"{run} has no results.jsonl: name the folder of a finished run")
+        raise FileNotFoundError(f"{run} has no {RESULTS}: name the folder of a finished run")
     rows = [
         row
         for row in read_rows(path)

@@ -7,7 +7,6 @@ options share it. A row is one JSON object in `results.jsonl`, with the results 
 from __future__ import annotations
 
 import json
-import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +17,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from filelock import FileLock
 from torchrl.envs import EnvBase
@@ -30,7 +28,6 @@ from lab.measures.source_errors import mean_revision
 from lab.methods.methods import Method
 from lab.options.options import Evaluation, Options, Run, with_parts
 from lab.options.stored_options import of_run, stored_options
-from lab.reporting.rows import read_rows
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
 from warmprior.evaluation import Episode, play_episode
@@ -360,15 +357,3 @@ def row(
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),
     }
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Write or replace a file of rows, and return it as a table."""
-    # JSON has no NaN, so null stands for it.
-    finite = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-        for row in rows
-    ]
-    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite)
-    write_atomic(path, lambda path: path.write_text(text))
-    return pd.DataFrame(read_rows(path))
