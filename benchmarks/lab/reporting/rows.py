@@ -84,7 +84,7 @@ def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
         raise ValueError(f"it has no {', '.join(missing)}, so it is no row of {whose}")
     for name, value in row.items():
         try:
-            form = column(name)[0]
+            form = column(name).form
         except KeyError:
             raise ValueError(f"it has an unknown column {name!r}") from None
         # Null stands for a measure that could not be taken, and for the seed of a mean over several.
