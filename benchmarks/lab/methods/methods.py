@@ -43,7 +43,7 @@ from warmprior import (
 )
 from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of, file_digest
-from warmprior.modules.prior import Source
+from warmprior.modules.source import Source
 from warmprior.objectives import Coupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
