@@ -19,14 +19,8 @@ from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import Algorithm
 from warmprior.options.evaluation import EVALUATION_SEED
-from warmprior.options.train_command import (
-    DEFAULT_PRIOR,
-    PRIOR_OF_TARGETS,
-    Data,
-    Evaluation,
-    Run,
-    Source,
-)
+from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
+from warmprior.options.train_command import Data, Evaluation, Run
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
@@ -288,7 +282,7 @@ def train(
     /,
     *,
     data: Data,
-    source: Source,
+    source: SourceOptions,
     training: TrainingConfig,
     evaluation: Evaluation,
     run: Run,
