@@ -25,7 +25,7 @@ from torchrl.record.loggers import get_logger
 from lab.demonstrations.data_options import DataOptions, without_images
 from lab.demonstrations.tasks import load_task, longest_of, space_of, task_places, title_of
 from lab.measures.source_errors import mean_revision
-from lab.methods.methods import Method
+from lab.methods.methods import Method, code_digest
 from lab.options.options import Evaluation, Options, Run, with_parts
 from lab.options.stored_options import of_run, stored_options
 from warmprior import WarmPriorActor
@@ -39,6 +39,7 @@ from warmprior.saving.checkpoint import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
+from warmprior.training.networks import own_network
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """Load the policy of averaged weights on the CPU, with this comparison's environment and grid."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
+        own_network(self.network)  # a worker process has not imported it
         # Runs with another time limit share the file.
         policy = load_policy(path).replace(environment=self.task().environment)
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
@@ -153,11 +155,12 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     """Return the policy of another method on a task, with the options of the policy `like`."""
+    network, own = asdict(like.network), own_network(like.network)
     identity = run_identity(
         task.identity,
         asdict(like.training),
         method=method.config(),
-        network=asdict(like.network),
+        network=network if own is None else network | {"code": code_digest(own)},
         device=like.run.device,
         compile=like.run.compile,
         versions={name: version(name) for name in ("torch", "warmprior")},
