@@ -142,7 +142,7 @@ class DataOptions(Resizing):
         from lab.demonstrations.scripted.tasks import EXPERTS
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.envs.rendering import require_rendering
-        from warmprior.envs.tasks import get_task
+        from warmprior.envs.robosuite_tasks import get_task
 
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
