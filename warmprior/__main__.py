@@ -18,6 +18,7 @@ from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import Algorithm
+from warmprior.options.data import PLACES
 from warmprior.options.evaluation import EVALUATION_SEED
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
 from warmprior.options.train_command import Data, Evaluation, Run
@@ -294,8 +295,7 @@ def train(
     $ python -m warmprior train lerobot:USER/NAME --images observation.images.front
 
     Args:
-        place: a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a
-            LeRobotDataset, or minari:NAME
+        place: {PLACES}
         data: options of the demonstrations
         source: options of the source
         training: options of the recipe
@@ -384,6 +384,9 @@ def train(
     else:
         print(f"what a robot has to give it: {command_of('info', saved)}; its loop: docs/your_robot.md")
     print(saved)
+
+
+train.__doc__ = str(train.__doc__).format(PLACES=PLACES)
 
 
 def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:

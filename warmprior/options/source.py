@@ -26,4 +26,6 @@ class SourceOptions:
     chunk: int = 8
 
 
-SourceOptions.__doc__ = str(SourceOptions.__doc__).format_map(globals())  # the help names the defaults
+SourceOptions.__doc__ = str(SourceOptions.__doc__).format(
+    DEFAULT_PRIOR=DEFAULT_PRIOR, PRIOR_OF_TARGETS=PRIOR_OF_TARGETS
+)
