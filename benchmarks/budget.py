@@ -49,10 +49,10 @@ def main(argv: list[str] | None) -> None:
     from lab.demonstrations.tasks import title_of
     from lab.reporting.plots import plot_lines
     from lab.reporting.report import labelled, per_seed, table, write_report
-    from lab.reporting.rows import PLAYED, read_rows
+    from lab.reporting.rows import PLAYED, RESULTS, read_rows, write_rows
     from lab.running.comparison import compare
     from lab.running.measuring import held_out
-    from lab.running.policies import policies_of, write_rows
+    from lab.running.policies import policies_of
     from warmprior.diagnostics import action_error, encoded_windows
 
     with started(options, "budget") as out:
@@ -66,9 +66,9 @@ def main(argv: list[str] | None) -> None:
             windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
             error_by_nfe = action_error(actor, encoded_windows(actor, windows), nfes=nfes)
             error |= {(policy.name, nfe): value for nfe, value in error_by_nfe.items()}
-        played = read_rows(out / "results.jsonl", PLAYED)
+        played = read_rows(out / RESULTS, PLAYED)
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
-        rows = write_rows(out / "results.jsonl", measured)
+        rows = write_rows(out / RESULTS, measured)
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["iterations", "nfe"], ascending=[True, False], kind="stable")
         lines = {"success": "success rate", "action_error": "held-out squared error"}

@@ -36,9 +36,10 @@ def main(argv: list[str] | None) -> None:
     from lab.reporting.paper import paper_curvature
     from lab.reporting.plots import plot_flow_paths
     from lab.reporting.report import counted, labelled, pooled, setting_title, table, write_report
+    from lab.reporting.rows import write_rows
     from lab.running.comparison import train_all
     from lab.running.measuring import held_out
-    from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors, write_rows
+    from lab.running.policies import facts_of, finished_policies, policies_of, trained_actors
     from warmprior.diagnostics import encoded_windows, flow_paths
 
     check_flows(options.sources.methods())

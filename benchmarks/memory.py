@@ -29,13 +29,13 @@ def main(argv: list[str] | None) -> None:
 
     from lab.reporting.plots import colors_of, new_figure, save
     from lab.reporting.report import baseline, summary, table
-    from lab.reporting.rows import PLAYED, read_rows
+    from lab.reporting.rows import PLAYED, RESULTS, read_rows
 
     # A row per setting, method and NFE.
     whose = "robomimic.py or pusht.py: name a run of these"
     summaries = []
     for run in args.runs:
-        rows = pd.DataFrame(read_rows(run / "results.jsonl", PLAYED, whose))
+        rows = pd.DataFrame(read_rows(run / RESULTS, PLAYED, whose))
         if "memory_gain" not in rows:
             raise ValueError(f"{run} measured no memory_gain: name a run of robomimic.py or pusht.py")
         top_k = stored_options(Options, run, None).evaluation.top_k  # as in the run's report

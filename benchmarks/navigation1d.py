@@ -91,8 +91,9 @@ def main(argv: list[str] | None) -> None:
     from lab.measures.straightness import straightness
     from lab.reporting.plots import plot_flow_paths, plot_navigation
     from lab.reporting.report import labelled, table, unlike, write_report
+    from lab.reporting.rows import RESULTS, write_rows
     from lab.running.comparison import train_all
-    from lab.running.policies import policies_of, trained_actors, write_rows
+    from lab.running.policies import policies_of, trained_actors
     from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 
     with started(options, "navigation1d") as out:
@@ -106,7 +107,7 @@ def main(argv: list[str] | None) -> None:
             for p in policies
             for nfe in p.method.nfes(options.evaluation.nfe)
         ]
-        rows = write_rows(out / "results.jsonl", judged)
+        rows = write_rows(out / RESULTS, judged)
         observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
         flows = []
         for seed in options.seeds:  # the source samples belong to the seed

@@ -160,14 +160,13 @@ def main(argv: list[str] | None) -> None:
     options = parse(AGENT_PRESETS, argv, "rl", __doc__, adapt=adapt)
     from lab.reporting.plots import plot_success
     from lab.reporting.report import labelled, setting_title, table, write_report
-    from lab.reporting.rows import AGENT, read_rows
+    from lab.reporting.rows import AGENT, RESULTS, read_rows, write_rows
     from lab.running.agents import frozen_policies
-    from lab.running.policies import write_rows
     from warmprior.rl.agent import delta_of
 
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
-        path = out / "results.jsonl"
+        path = out / RESULTS
         rows, failures = read_rows(path, AGENT) if path.exists() else [], []
         arms = [arm for method in frozen for arm in options.arms(method)]
         for seed, arm in product(options.seeds, sorted(arms, key=lambda arm: arm.algorithm)):

@@ -38,9 +38,10 @@ def main(argv: list[str] | None) -> None:
     from lab.reporting.paper import paper_success
     from lab.reporting.plots import plot_lines
     from lab.reporting.report import labelled, per_seed, pooled, table, write_report
+    from lab.reporting.rows import write_rows
     from lab.running.comparison import compare
     from lab.running.measuring import held_out
-    from lab.running.policies import policies_of, trained_actors, write_rows
+    from lab.running.policies import policies_of, trained_actors
 
     check_single(options, "nfe", "temperature")
     check_flows(options.sources.methods())

@@ -139,7 +139,7 @@ def forked_workers(monkeypatch):
 @pytest.fixture(scope="module")
 def short_episodes():
     """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
-    from warmprior.envs.tasks import TaskSpec
+    from warmprior.envs.robosuite_tasks import TaskSpec
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)

@@ -134,14 +134,14 @@ def test_both_sides_of_the_diff_run(capsys):
 
 def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
     monkeypatch.syspath_prepend(DOCS / "figures")
-    names = ("results", "leaderboard", "pages", "shared")
-    results, leaderboard, pages, shared = map(importlib.import_module, names)
-    tables = results.tables() | leaderboard.tables()
-    texts = {page: page.read_text() for page in tables}
-    for page, table in tables.items():
-        assert pages.with_tables(texts[page], table) == texts[page]
+    names = ("results", "leaderboard", "tables", "shared")
+    results, leaderboard, tables, shared = map(importlib.import_module, names)
+    marked = results.tables() | leaderboard.tables()
+    texts = {page: page.read_text() for page in marked}
+    for page, table in marked.items():
+        assert tables.with_tables(texts[page], table) == texts[page]
     text = "".join(texts.values())
-    played = {name for _, name, _ in pages.PLAYED.findall(text)}
+    played = {name for _, name, _ in tables.PLAYED.findall(text)}
     assert played == {path.stem for path in shared.DATA.iterdir()}
     shown = set(re.findall(r"_static/results/(\w+)\.svg\)", text))
     assert shown == {path.stem for path in shared.OUT.iterdir()}

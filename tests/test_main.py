@@ -9,7 +9,7 @@ from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import missing
 from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior import PastPrior, VelocityMLP, VelocityNetwork, WarmPriorActor, policy_transforms
 from warmprior.__main__ import main
 from warmprior.saving.policies import load_policy, save_policy
 
@@ -185,6 +185,47 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys, monkeypat
     assert main([*small, "--nfe", "1"]) == 0
     assert load_policy(folder).sampling.nfe == 1
     assert not missing(capsys.readouterr().err, folder, "nfe was 3 and is 1")
+
+
+STRAIGHT = """
+import torch
+from warmprior import VelocityNetwork
+
+class Straight(VelocityNetwork):
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps, scale=1.0):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        self.scale = scale
+        self.velocity = torch.nn.Parameter(torch.zeros(prediction_length, action_dim))
+
+    def forward(self, t, a, observation):
+        return self.scale * self.velocity.expand_as(a)
+"""
+
+
+def test_a_network_of_ones_own_is_trained_and_imported_again(tmp_path, capsys, monkeypatch):
+    path, out = tmp_path / "lift.hdf5", tmp_path / "out"
+    write_robomimic_file(path, lengths=(30, 40), task="lift")
+    (tmp_path / "straight_networks.py").write_text(STRAIGHT)
+    monkeypatch.syspath_prepend(tmp_path)
+    argv = ["train", str(path), "--out", str(out), "--iterations", "1", "--network"]
+    try:
+        assert main([*argv, "straight_networks:Straight,scale=2.0"]) == 0
+        folder = capsys.readouterr().out.splitlines()[-1]
+        trained = load_policy(folder).network.network
+        assert (type(trained).__name__, trained.scale) == ("Straight", 2.0)
+        assert (trained.velocity != 0).all()  # one step of Adam moves every weight
+        del VelocityNetwork.classes["Straight"], sys.modules["straight_networks"]  # as in another process
+        assert not missing(refused(["info", folder], capsys), "velocity network", "'Straight'", "import")
+        assert main(["info", folder, "--import", "straight_networks"]) == 0
+        assert "Straight" in capsys.readouterr().out
+        for words, fact in (
+            (["straight_networks:Crooked"], "Crooked"),
+            (["straight_networks:Straight", "--hidden-dim", "8"], "--hidden-dim"),
+        ):
+            assert not missing(refused([*argv, *words], capsys), fact)
+    finally:
+        VelocityNetwork.classes.pop("Straight", None)
+        sys.modules.pop("straight_networks", None)
 
 
 def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):

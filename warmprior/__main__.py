@@ -18,15 +18,10 @@ from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import Algorithm
+from warmprior.options.data import PLACES
 from warmprior.options.evaluation import EVALUATION_SEED
-from warmprior.options.train_command import (
-    DEFAULT_PRIOR,
-    PRIOR_OF_TARGETS,
-    Data,
-    Evaluation,
-    Run,
-    Source,
-)
+from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
+from warmprior.options.train_command import Data, Evaluation, Run
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
@@ -291,7 +286,7 @@ def train(
     /,
     *,
     data: Data,
-    source: Source,
+    source: SourceOptions,
     training: TrainingConfig,
     evaluation: Evaluation,
     run: Run,
@@ -303,8 +298,7 @@ def train(
     $ python -m warmprior train lerobot:USER/NAME --images observation.images.front
 
     Args:
-        place: a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a
-            LeRobotDataset, or minari:NAME
+        place: {PLACES}
         data: options of the demonstrations
         source: options of the source
         training: options of the recipe
@@ -319,10 +313,13 @@ def train(
     from warmprior.tasks import Play, Task
     from warmprior.training import train_policy
     from warmprior.training.cloning import policy_path
+    from warmprior.training.networks import own_network
     from warmprior.training.option_text import make
 
     check_device(run.device)  # before the demonstrations are read
-    make(Prior, source.prior or DEFAULT_PRIOR, source.chunk)  # an error is better raised here
+    if own_network(network) is not None and network.hidden_dim is not None:  # better raised here
+        raise ValueError(f"--hidden-dim does not reach {network.network}: write its options behind the name")
+    make(Prior, source.prior or DEFAULT_PRIOR, source.chunk)
     sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(
         place,
@@ -390,6 +387,9 @@ def train(
     else:
         print(f"what a robot has to give it: {command_of('info', saved)}; its loop: docs/your_robot.md")
     print(saved)
+
+
+train.__doc__ = str(train.__doc__).format(PLACES=PLACES)
 
 
 def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:

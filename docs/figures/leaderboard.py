@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from pages import own_best, write
 from pandas import DataFrame, concat
 from results import CHOICES, GROUPS, TWENTY_FIVE, all_lengths, paper_table
 from scipy.stats import rankdata
@@ -36,6 +35,7 @@ from shared import (
     shown_sources,
     with_own_noise,
 )
+from tables import own_best, write
 
 from lab.measures.statistics import interval, spread_of
 from lab.reporting.paper import PAPER_SUCCESS

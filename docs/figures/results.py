@@ -14,7 +14,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from pages import write
 from pandas import DataFrame, concat
 from shared import (
     CORRELATED,
@@ -39,6 +38,7 @@ from shared import (
     shown_sources,
     with_own_noise,
 )
+from tables import write
 
 from lab.measures.statistics import chosen_elsewhere
 from lab.reporting.paper import PAPER_SUCCESS, STATE

@@ -8,7 +8,7 @@ from lab.demonstrations.data_options import DataOptions
 from lab.demonstrations.scripted.generate import generate_demonstrations
 from tests.processes import here
 from warmprior.data import convert_robomimic, open_demonstrations
-from warmprior.envs.tasks import TaskSpec
+from warmprior.envs.robosuite_tasks import TaskSpec
 from warmprior.tasks import Task
 
 

@@ -31,7 +31,7 @@ from warmprior import (
 )
 from warmprior.diagnostics import curvature, flow_paths
 from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
-from warmprior.envs.tasks import TASKS
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.modules.schedule import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import delta_of

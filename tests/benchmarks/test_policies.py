@@ -1,4 +1,5 @@
 import json
+import sys
 from itertools import product
 
 import pytest
@@ -19,7 +20,7 @@ from tests.benchmarks.script_parts import refused, stored, written
 from tests.errors import refuses
 from tests.processes import apart
 from tests.together import together
-from warmprior import RealTimeChunking, policy_transforms
+from warmprior import RealTimeChunking, VelocityNetwork, policy_transforms
 from warmprior.diagnostics import smoothness
 from warmprior.evaluation import play_episode
 from warmprior.io.distributed import rank, world_size
@@ -164,7 +165,7 @@ def test_every_method_is_trained_with_what_it_needs_before_it(tmp_path, capsys):
     assert robomimic.main(argv) == 0
     # What a file says is not imported: only what was typed.
     again = ["--resume", "--out", tmp_path / "out"]
-    assert "name it again, with --prior or --task" in refused(robomimic.main, again, capsys)
+    assert "name it again, with --prior" in refused(robomimic.main, again, capsys)
     rows = {row["prior"]: row for row in stored(tmp_path / "out")}
     assert set(rows) == {*names, "widening"}
     policies = {p.method.name: p for p in policies_of([*argv, "--resume"])}
@@ -179,6 +180,45 @@ def test_every_method_is_trained_with_what_it_needs_before_it(tmp_path, capsys):
         # A training needs its teacher's.
         assert (rows[name]["training_seconds"] > own_time) == (name == "reflow")
     assert policies["widening"].load().prior.scale.item() != 1.0
+
+
+NETWORK = """
+import torch
+from warmprior import VelocityNetwork
+
+class Resting(VelocityNetwork):
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        self.velocity = torch.nn.Parameter(torch.zeros(prediction_length, action_dim))
+
+    def forward(self, t, a, observation):
+        return self.velocity.expand_as(a)
+"""
+
+
+def test_a_network_of_ones_own_is_found_in_a_fresh_process_and_trained_again_if_edited(
+    tmp_path, capsys, monkeypatch
+):
+    file, name = tmp_path / "networks_of_mine.py", "networks_of_mine:Resting"
+    file.write_text(NETWORK)
+    monkeypatch.syspath_prepend(tmp_path)
+    few = {"iterations": 1, "checkpoints": 1, "episodes": 1, "seeds": 1, "nfe": 1, "prior": "past"}
+    argv = arguments(tmp_path / "out", network=name, **few)
+    try:
+        assert robomimic.main(argv) == 0
+        again = ["--resume", "--out", tmp_path / "out"]
+        assert "--network" in refused(robomimic.main, again, capsys)  # what a file says is not imported
+        (policy,) = policies_of([*argv, "--resume"])
+        del VelocityNetwork.classes["Resting"], sys.modules["networks_of_mine"]
+        assert policy.is_trained and type(policy.load().network.network).__name__ == "Resting"
+        file.write_text(NETWORK + "# edited\n")
+        (edited,) = policies_of([*argv, "--resume"])
+        assert edited.name != policy.name and not edited.is_trained
+        wrong = arguments(tmp_path / "wrong", network="networks_of_mine:Missing", **few)
+        assert "--network networks_of_mine:Missing" in refused(robomimic.main, wrong, capsys)
+    finally:
+        VelocityNetwork.classes.pop("Resting", None)
+        sys.modules.pop("networks_of_mine", None)
 
 
 def test_a_training_that_fails_costs_its_own_rows_alone(tmp_path, capsys, monkeypatch):

@@ -19,7 +19,7 @@ from lab.running import pictures
 from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.processes import apart
 from warmprior.envs import rendering_backend
-from warmprior.envs.tasks import TaskSpec
+from warmprior.envs.robosuite_tasks import TaskSpec
 from warmprior.saving.checkpoint import load_state
 
 

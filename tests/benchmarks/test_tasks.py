@@ -21,7 +21,7 @@ from warmprior import ImageEncoder
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
-from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.envs.robosuite_tasks import TASKS, TaskSpec
 from warmprior.saving import load_policy
 from warmprior.saving.checkpoint import load_state
 

@@ -11,8 +11,8 @@ pytest.importorskip("h5py")
 import h5py
 import numpy as np
 
+from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import task_env_args
-from warmprior.envs.tasks import get_task
 
 WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 

@@ -13,6 +13,7 @@ from warmprior import PastPrior
 from warmprior.__main__ import main
 from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations, opening
 from warmprior.data.index import DatasetIndex, DemonstrationReader
+from warmprior.options.data import PLACES
 from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -111,3 +112,8 @@ def test_steps_and_their_demonstrations_train_the_same_policy():
     one, *others = (train_policy(g, PastPrior(4), description=None, **options).state_dict() for g in given)
     for other in others:
         assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_help_names_the_places_of_every_format():
+    prefixes = {kind.prefix for kind in opening.FORMATS} - {""}
+    assert len(prefixes) > 1 and {prefix for prefix in prefixes if prefix in PLACES} == prefixes

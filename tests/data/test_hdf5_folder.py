@@ -12,7 +12,7 @@ from tests.errors import missing, raises, refuses
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
-from warmprior.envs.tasks import get_task
+from warmprior.envs.robosuite_tasks import get_task
 from warmprior.tasks import Task
 
 LENGTHS = {"monday": (6, 4), "friday": (9,), "sunday": (5, 3, 7)}

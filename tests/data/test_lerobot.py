@@ -11,7 +11,7 @@ from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 from warmprior.data.formats.lerobot_index import action_names, state_names
-from warmprior.envs.tasks import TASKS
+from warmprior.envs.robosuite_tasks import TASKS
 
 H, TO = 4, 3
 

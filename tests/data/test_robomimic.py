@@ -16,7 +16,7 @@ from tests.errors import missing
 from tests.processes import apart
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.envs import absolute_actions
-from warmprior.envs.tasks import TASKS
+from warmprior.envs.robosuite_tasks import TASKS
 
 
 def _state(demo, task):

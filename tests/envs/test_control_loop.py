@@ -13,8 +13,8 @@ from robosuite.wrappers import Wrapper
 from tests.errors import refuses
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import make_simulator, task_env_args
-from warmprior.envs.tasks import TASKS
 
 TOLERANCE = 1e-9  # radians, over ten control steps
 

@@ -18,8 +18,8 @@ from tests.errors import raises
 from tests.processes import apart
 from tests.toy_env import closing
 from warmprior.envs import RobosuiteEnv, rendering_backend
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
-from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15, fast_rendering=True)
 

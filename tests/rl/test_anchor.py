@@ -17,7 +17,7 @@ from warmprior import (
     PreviewPrior,
     PriorAnchor,
 )
-from warmprior.modules.prior import Source
+from warmprior.modules.source import Source
 
 H = 3
 LENGTHS = (7, 4)

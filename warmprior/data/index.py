@@ -22,7 +22,7 @@ from warmprior.checks import (
     given,
 )
 from warmprior.envs.env_args import declared_actions
-from warmprior.envs.tasks import TaskSpec
+from warmprior.envs.robosuite_tasks import TaskSpec
 from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length

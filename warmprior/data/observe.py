@@ -14,8 +14,8 @@ from warmprior.data.formats.hdf5 import member, open_robomimic, read_described, 
 from warmprior.data.index import DatasetError, check_count, check_env_args, store_finite
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.env_args import modernize_env_args
+from warmprior.envs.robosuite_tasks import low_dim_keys
 from warmprior.envs.simulator import make_simulator, scene_stays
-from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, write_atomic
 

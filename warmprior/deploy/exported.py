@@ -28,9 +28,10 @@ from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.generator import Drawing
 from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.prior import Prior, noise_factor
+from warmprior.modules.prior import Prior
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
+from warmprior.modules.source import noise_factor
 
 FIELDS = {
     *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),

@@ -24,7 +24,8 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import LinearInterpolant
 from warmprior.modules.network import velocity_field
 from warmprior.modules.ode import integrate
-from warmprior.modules.prior import Prior, Source
+from warmprior.modules.prior import Prior
+from warmprior.modules.source import Source
 
 
 def branching_cost(

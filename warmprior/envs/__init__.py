@@ -19,7 +19,7 @@ from warmprior.envs.navigation1d import (
 )
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv
-from warmprior.envs.tasks import TASKS, TaskSpec, get_task
+from warmprior.envs.robosuite_tasks import TASKS, TaskSpec, get_task
 
 __all__ = [
     "TASKS",

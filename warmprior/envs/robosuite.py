@@ -16,9 +16,9 @@ from warmprior.checks import check_choice, check_whole_numbers
 from warmprior.envs.control_loop import ControlLoop, StepLoop, is_plain
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers
+from warmprior.envs.robosuite_tasks import STYLES, task_of_env
+from warmprior.envs.robosuite_tasks import low_dim_keys as default_keys
 from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
-from warmprior.envs.tasks import STYLES, task_of_env
-from warmprior.envs.tasks import low_dim_keys as default_keys
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warmprior.envs.mimicgen import is_mimicgen, register_mimicgen
-from warmprior.envs.tasks import get_task
+from warmprior.envs.robosuite_tasks import get_task
 from warmprior.io.extras import require
 
 # Sizes drawn when a model is loaded (Lift's cube, Transport's hammer) must be the same in every

@@ -22,7 +22,8 @@ from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.generator import Drawing
 from warmprior.modules.network import network_observation
 from warmprior.modules.ode import Sampling
-from warmprior.modules.prior import Prior, noise_factor
+from warmprior.modules.prior import Prior
+from warmprior.modules.source import noise_factor
 
 _TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()
 """A lock per policy: decisions take turns, because each replaces the policy's sampler for its duration."""

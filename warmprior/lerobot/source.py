@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from warmprior.checks import check_positive, check_shape
 from warmprior.history import check_history, cold_history, window_history, without
 from warmprior.lerobot.ports import port_for
-from warmprior.modules.prior import Prior, Source
+from warmprior.modules.prior import Prior
+from warmprior.modules.source import Source
 
 
 class ChunkSource:

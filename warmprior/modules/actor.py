@@ -18,10 +18,11 @@ from warmprior.history import history_keys
 from warmprior.modules.generator import Drawing
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor
-from warmprior.modules.prior import Prior, Source, noise_factor
+from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import Registered, kept_arguments
+from warmprior.modules.source import Source, noise_factor
 
 
 class StartPoint(Registered, nn.Module):

@@ -15,7 +15,8 @@ from torchrl.modules import MLP
 from warmprior import keys
 from warmprior.checks import check_positive, check_shape, check_whole_numbers, given
 from warmprior.modules.learning import inside_mean, minimise, widths_of
-from warmprior.modules.prior import GaussianPrior, Prior, Source
+from warmprior.modules.prior import GaussianPrior, Prior
+from warmprior.modules.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """The loss, and how it pairs sources with targets."""
 
-from warmprior.objectives.couplings import OTCoupling, ReflowCoupling
-from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
+from warmprior.objectives.couplings import Coupling, OTCoupling, ReflowCoupling
+from warmprior.objectives.flow_matching import FlowMatchingLoss
 
 __all__ = [
     "Coupling",

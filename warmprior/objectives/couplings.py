@@ -1,7 +1,8 @@
-"""OT-CFM and 2-rectified flow: how the sources and targets of a batch are paired."""
+"""How the sources and targets of a batch are paired: OT-CFM, 2-rectified flow, or a function of your own."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -13,6 +14,14 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of
+
+Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
+"""A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
+
+The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
+may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
+``times``, a path and training times that the loss uses instead of its own.
+"""
 
 
 class OTCoupling:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast, get_args
 
@@ -20,16 +20,9 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.generator import Drawing
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import device_of, network_observation, velocity_field
+from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.times import TIMES, Times
 from warmprior.options.training import Objective, Weighting
-
-Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
-"""A function that pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, chunks ``[*B, P, d_a]``.
-
-The observations ``[*B, To, d_o]`` belong to the targets, so a coupling permutes ``a0`` or replaces ``a1``. It
-may have a ``config()``, which a training run compares before it continues, and an ``interpolant`` and
-``times``, a path and training times that the loss uses instead of its own.
-"""
 
 FAR_OUTSIDE = 10.0
 """A size that no normalised action has; those of other demonstrations reach a little past 1."""

@@ -10,6 +10,12 @@ Actions = Literal["delta", "absolute"]
 
 Resize = Literal["squeeze", "pad"]
 
+PLACES = (
+    "a robomimic HDF5 file or a folder of them, lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or "
+    "minari:NAME"
+)
+"""The places of demonstrations, as help says them: one per format of ``warmprior.data.opening.FORMATS``."""
+
 IMAGE_SIZE = 84
 """The default side of images in pixels, as in the paper (Table 3)."""
 

@@ -1,4 +1,4 @@
-"""Options of ``python -m warmprior train``, in addition to those of networks and trainings."""
+"""Options of ``python -m warmprior train``, in addition to those of sources, networks and trainings."""
 
 from __future__ import annotations
 
@@ -6,12 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warmprior.options.data import Actions, Resizing
-
-DEFAULT_PRIOR = "past,correlation=0.5"
-"""The source of ``train`` and of the plugin, with its options, unless actions are absolute targets."""
-
-PRIOR_OF_TARGETS = "gaussian"
-"""The source of ``train`` and of the plugin for absolute targets; it needs the same steps."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +37,6 @@ class Data(Resizing):
     style: str | None = None
     horizon: int | None = None
     fast_rendering: bool = False
-
-
-@dataclass(frozen=True)
-class Source:
-    """The options of the source.
-
-    Attributes:
-        prior: source (gaussian, past, preview, cvae, or package.module:Class of your own), with options as
-            in past,sigma=0.3; by default past,correlation=0.5, or gaussian if actions are absolute targets
-        chunk: chunk length H
-    """
-
-    prior: str | None = None
-    chunk: int = 8
 
 
 @dataclass(frozen=True)

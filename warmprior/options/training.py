@@ -35,8 +35,9 @@ class NetworkOptions:
 
     Attributes:
         network: mlp is small; chi_transformer is the paper's, and plain_mlp that of its toy
-            task; adaln_transformer is a faster transformer (adaptive layer norm).
-        hidden_dim: width of the network; the class's own by default.
+            task; adaln_transformer is a faster transformer (adaptive layer norm); or package.module:Class of
+            your own, with options as in package.module:Class,width=64.
+        hidden_dim: width of a network that a name above stands for; the class's own by default.
         precondition: use the second moments of source and data, see PreconditionedNetwork.
         slope: slope of preconditioning's linear part: over all data (marginal), or given the observation
             (conditional).
@@ -57,7 +58,7 @@ class NetworkOptions:
         2
     """
 
-    network: Network = "mlp"
+    network: Network | str = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     slope: Slope = "marginal"
@@ -71,7 +72,8 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         check_whole_numbers(observation_steps=self.observation_steps)
         check_whole_numbers(**given(hidden_dim=self.hidden_dim, crop_size=self.crop_size))
-        check_choice("network", self.network, get_args(Network))
+        if not self.is_own:
+            check_choice("network", self.network, get_args(Network))
         check_choice("encoder", self.encoder, get_args(Encoder))
         check_choice("slope", self.slope, get_args(Slope))
         if self.slope != "marginal" and not self.precondition:
@@ -84,6 +86,11 @@ class NetworkOptions:
                     f"{name} belongs to {' and '.join(TRANSFORMERS)}: leave it None with the network "
                     f"{self.network}"
                 )
+
+    @property
+    def is_own(self) -> bool:
+        """Return True if the network is a user's class, in place of a name."""
+        return ":" in self.network
 
     @property
     def of_transformers(self) -> dict[str, Any]:

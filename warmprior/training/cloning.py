@@ -22,7 +22,7 @@ from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of, uncompiled
-from warmprior.objectives.flow_matching import Coupling
+from warmprior.objectives.couplings import Coupling
 from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     RunState,

@@ -17,7 +17,8 @@ from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import compiling
 from warmprior.modules.schedule import warmup_cosine
-from warmprior.objectives.flow_matching import Coupling, FlowMatchingLoss
+from warmprior.objectives.couplings import Coupling
+from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.options.training import TrainingConfig
 from warmprior.saving.checkpoint import (
     module_tensors,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
+from warmprior.checks import given
 from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
@@ -15,14 +17,23 @@ from warmprior.modules import (
 )
 from warmprior.modules.encoder import load_imagenet
 from warmprior.options.data import Resize
-from warmprior.options.training import OF_IMAGES, PRETRAINED, Network, NetworkOptions
+from warmprior.options.training import OF_IMAGES, PRETRAINED, NetworkOptions
+from warmprior.training.option_text import find, make
 
-_NETWORKS: dict[Network, tuple[type[VelocityNetwork], str]] = {
+_NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),
     "plain_mlp": (PlainMLP, "hidden_dim"),
     "chi_transformer": (ChiTransformer, "embedding_dim"),
     "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
 }
+
+
+def own_network(options: NetworkOptions) -> type[VelocityNetwork] | None:
+    """Import a user's network, and return its class; return ``None`` for others.
+
+    A saved policy that has one is then loaded. Raises ValueError if there is no such network.
+    """
+    return find(VelocityNetwork, options.network.partition(",")[0]) if options.is_own else None
 
 
 def make_network(
@@ -36,7 +47,7 @@ def make_network(
     """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
     With images, ``d_o`` is the width of the vector, and ``resize`` how the images got their size. Raises
-    ValueError for options of images without any.
+    ValueError for options of images without any, and for a network of the user's that cannot be built.
 
     Examples:
         >>> import torch
@@ -46,10 +57,6 @@ def make_network(
         >>> network(torch.zeros(1), torch.zeros(1, 8, 7), torch.zeros(1, options.observation_steps, 23)).shape
         torch.Size([1, 8, 7])
     """
-    kind, width = _NETWORKS[options.network]
-    arguments = options.of_transformers
-    if options.hidden_dim is not None:
-        arguments[width] = options.hidden_dim
     encoder = None
     unused = [name for name in OF_IMAGES if getattr(options, name) != getattr(NetworkOptions, name)]
     if unused and not images:
@@ -67,5 +74,11 @@ def make_network(
         if options.encoder == PRETRAINED:
             load_imagenet(encoder)
         observation_dim = encoder.observation_dim
-    network = kind(action_dim, observation_dim, prediction_length, options.observation_steps, **arguments)
+    sizes = (action_dim, observation_dim, prediction_length, options.observation_steps)
+    if options.is_own:
+        network = make(VelocityNetwork, options.network, *sizes)
+    else:
+        kind, width = _NETWORKS[options.network]
+        arguments: Any = options.of_transformers | given(**{width: options.hidden_dim})
+        network = kind(*sizes, **arguments)
     return network if encoder is None else VisionNetwork(encoder, network)

@@ -25,7 +25,7 @@ from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingTrend
-from warmprior.objectives.flow_matching import Coupling
+from warmprior.objectives.couplings import Coupling
 from warmprior.options.training import NetworkOptions, Slope, TrainingConfig
 from warmprior.saving.policies import load_policy
 from warmprior.tasks.task import Task

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from warmprior.checks import check_whole_numbers
 from warmprior.io.extras import require
-from warmprior.options.data import Actions, Resizing
+from warmprior.options.data import PLACES, Actions, Resizing
 from warmprior.options.training import OF_IMAGES, PRETRAINED, NetworkOptions
 
 GENERATED = 150
@@ -85,8 +85,7 @@ class DataOptions(Resizing):
             returns a Task (default: can in the quick preset, otherwise square, or the dataset's)
         style: styles of the demonstrations: ph (one operator) or mh (six operators), in MimicGen's files
             source (human) or core (generated from source)
-        dataset: demonstrations in place of generated ones: a robomimic HDF5 file or a folder of them,
-            lerobot:FOLDER or lerobot:USER/NAME of a LeRobotDataset, or minari:NAME
+        dataset: demonstrations in place of generated ones: {PLACES}
         download: download the official demonstrations, in place of generated ones
         force_download: download the official demonstrations again, in place of a broken local copy
         mask: mask of the file, such as train, whose demonstrations to use (default: all)
@@ -142,7 +141,7 @@ class DataOptions(Resizing):
         from lab.demonstrations.scripted.tasks import EXPERTS
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.envs.rendering import require_rendering
-        from warmprior.envs.tasks import get_task
+        from warmprior.envs.robosuite_tasks import get_task
 
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
@@ -218,6 +217,9 @@ class DataOptions(Resizing):
     def count(self, style: str) -> int:
         """Return the number of scripted demonstrations of a style."""
         return self.first(style) or GENERATED
+
+
+DataOptions.__doc__ = str(DataOptions.__doc__).format(PLACES=PLACES)
 
 
 def without_images(network: NetworkOptions) -> NetworkOptions:

@@ -57,7 +57,7 @@ def download_robomimic(
         ValueError: tool_hang has no official 'mh' data; it has: ph
     """
     from warmprior.envs.mimicgen import is_mimicgen
-    from warmprior.envs.tasks import TASKS
+    from warmprior.envs.robosuite_tasks import TASKS
 
     official = OFFICIAL
     if task not in official:

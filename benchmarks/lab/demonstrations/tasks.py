@@ -20,7 +20,7 @@ from warmprior.data import Demonstrations, demonstrations_of, open_demonstration
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.images import check_images, renderer_versions
 from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
-from warmprior.envs.tasks import TASKS
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.io.files import digest_of
 from warmprior.keys import EPISODE
 from warmprior.options.data import IMAGE_SIZE

@@ -15,7 +15,8 @@ from warmprior import keys
 from warmprior.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.actor import StartPoint
 from warmprior.modules.learning import inside_mean, minimise, widths_of
-from warmprior.modules.prior import PastPrior, Source
+from warmprior.modules.prior import PastPrior
+from warmprior.modules.source import Source
 
 # Smallest calibrated standard deviation of a learned Gaussian source, in normalised action units.
 SCALE_FLOOR = 0.02

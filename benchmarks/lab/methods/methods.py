@@ -43,7 +43,7 @@ from warmprior import (
 )
 from warmprior.checks import check_finite_numbers
 from warmprior.io.files import digest_of, file_digest
-from warmprior.modules.prior import Source
+from warmprior.modules.source import Source
 from warmprior.objectives import Coupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
@@ -211,6 +211,11 @@ def own_files(kind: type) -> list[Path]:
     return files
 
 
+def code_digest(kind: type) -> str:
+    """Return a digest of a user's code: a policy is trained again when they edit it."""
+    return digest_of(*map(file_digest, own_files(kind)))
+
+
 def label(name: str, options: str = "") -> str:
     """Return the name of a method in tables and figures, such as `WP-Past, correlation=0.5`."""
     return ", ".join(filter(None, (METHODS[name].label if name in METHODS else name, options)))
@@ -292,8 +297,7 @@ class Method:
         """Return everything that makes it differ from other methods, as JSON."""
         config = {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
         if self.text.partition(",")[0] not in METHODS:
-            # A policy is trained again when a user edits their own prior, or code of theirs that it uses.
-            config["code"] = digest_of(*map(file_digest, own_files(self.parts.prior)))
+            config["code"] = code_digest(self.parts.prior)
         return config
 
     @property

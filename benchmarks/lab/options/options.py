@@ -189,14 +189,18 @@ class Options:
         import torch
 
         from warmprior.training import make_network
+        from warmprior.training.networks import own_network
 
         self.data.check()
         self.evaluation.check()
         check_network(self.network, self.data)
         with naming("--batch-size", self.training.batch_size):
             check_batch(self.training.batch_size)
-        with naming("--hidden-dim", self.network.hidden_dim), torch.device("meta"):  # nothing is computed
-            make_network(without_images(self.network), 1, 1, 2)
+        with naming("--network", self.network.network):
+            own = own_network(self.network)
+        if own is None:
+            with naming("--hidden-dim", self.network.hidden_dim), torch.device("meta"):  # nothing is computed
+                make_network(without_images(self.network), 1, 1, 2)
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):
             raise ValueError(
                 "--actions absolute is for robosuite's tasks, and a task of your own has its own: add "

@@ -107,6 +107,6 @@ def from_record[O: Options](kind: type[O], tree: Any) -> O:
 
 def check_typed(stored: Options, out: Path, importable: Sequence[str]) -> None:
     """Raise ValueError if stored options name a class that may not be imported."""
-    for name in (*stored.sources.prior, *stored.data.task):
+    for name in (*stored.sources.prior, *stored.data.task, stored.network.network):
         if ":" in name and name not in importable:
-            raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")
+            raise ValueError(f"{out} uses {name}: name it again, with --prior, --network or --task as before")

@@ -22,20 +22,14 @@ from lab.measures.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, 
 from lab.methods.methods import label
 from lab.options.options import Options, with_parts
 from lab.options.presets import IMAGES
-from lab.reporting.columns import COLUMNS, IDENTITY, column
+from lab.reporting.columns import COLUMNS, IDENTITY, RELATIVE, SHOWN, column
 from lab.reporting.paper import PAPER_SUCCESS, paper_success
-from lab.reporting.rows import read_rows
+from lab.reporting.rows import RESULTS, read_rows
 from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_json, write_atomic
 
 FACTS = ["task", "data", "prior", "options", "sigma", "chunk"]  # columns that describe a method
-RELATIVE = ["kappa", "relative_curvature", "bound", "training_seconds"]  # also shown as ratios
 BOUNDS = {"source_leak": LEAK_BOUND, "inner_step_ratio": INNER_STEP_BOUND}  # values above are marked (!)
-SHOWN = [  # columns below the success rates of report.md
-    *("success", "gain", "won", "lost", *BOUNDS, "memory_gain", "boundary_jump", "inner_jump"),
-    *(f"{name}_ratio" for name in RELATIVE),
-    *("coverage", "mean_error", "mean_revision_data", "mean_revision"),
-]
 
 
 # Rows
@@ -218,13 +212,13 @@ def table(rows: DataFrame, keys: Sequence[str], names: Iterable[str], notes: Seq
     present = [name for name in names if name in rows and rows[name].notna().any()]
     lines = []
     for _, group in rows.groupby(list(keys), sort=False, dropna=False):
-        start = {key: format(group[key].iloc[0], column(key)[0]) for key in keys}
+        start = {key: format(group[key].iloc[0], column(key).form) for key in keys}
         lines.append(start | {name: _entry(group, name) for name in present})
     return markdown(DataFrame(lines), notes)
 
 
 def _entry(group: DataFrame, name: str) -> str:
-    form, values = column(name)[0], group[name].dropna().astype(float)
+    form, values = column(name).form, group[name].dropna().astype(float)
     if values.empty:
         return "-"
     mean = values.mean()
@@ -428,7 +422,7 @@ def write_report(out: Path, short: str, full: str, frame: DataFrame, failures: S
     listed = "".join(f"- {failure}\n" for failure in failures)
     missing = f"\nMissing:\n\n{listed}" if failures else ""
     names = [*frame.columns, *(n for n in COLUMNS if n not in frame and f"| {n} |" in full)]
-    meanings = "".join(f"- `{name}`: {column(name)[1]}\n" for name in names)
+    meanings = "".join(f"- `{name}`: {column(name).meaning}\n" for name in names)
     full = f"{full.rstrip()}\n{missing}\nColumns, here and in results.csv:\n\n{meanings}"
     write_atomic(out / "report.md", lambda path: path.write_text(full, encoding="utf-8"))
     write_atomic(out / "results.csv", lambda path: frame.to_csv(path, index=False))
@@ -458,9 +452,9 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         ...     policy_results(folder, "policies/lift-ph/policy_000020")[0]["success_rate"]
         0.5
     """
-    path, folder = Path(run) / "results.jsonl", Path(policy).resolve()
+    path, folder = Path(run) / RESULTS, Path(policy).resolve()
     if not path.is_file():
-        raise FileNotFoundError(f"{run} has no results.jsonl: name the folder of a finished run")
+        raise FileNotFoundError(f"{run} has no {RESULTS}: name the folder of a finished run")
     rows = [
         row
         for row in read_rows(path)

@@ -1,4 +1,4 @@
-"""Rows of results, checked when they are read.
+"""Rows of results, written, and checked when they are read.
 
 A row is one JSON object in a file of lines. Its columns are defined in `columns.py`; their formats say their
 types.
@@ -6,13 +6,20 @@ types.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from lab.io.files import read_lines
 from lab.reporting.columns import IDENTITY, column
+from warmprior.io.files import write_atomic
+
+RESULTS = "results.jsonl"
+"""The file of a run with a row per evaluation."""
 
 COUNTED = ("episodes", "successes", "success_rate")
 """Every row of played episodes has these columns."""
@@ -60,12 +67,24 @@ def read_rows(
     return rows
 
 
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write or replace a file of rows, and return it as a table."""
+    # JSON has no NaN, so null stands for it.
+    finite = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        for row in rows
+    ]
+    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite)
+    write_atomic(path, lambda path: path.write_text(text))
+    return pd.DataFrame(read_rows(path))
+
+
 def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
     if missing := [name for name in needed if name not in row]:
         raise ValueError(f"it has no {', '.join(missing)}, so it is no row of {whose}")
     for name, value in row.items():
         try:
-            form = column(name)[0]
+            form = column(name).form
         except KeyError:
             raise ValueError(f"it has an unknown column {name!r}") from None
         # Null stands for a measure that could not be taken, and for the seed of a mean over several.

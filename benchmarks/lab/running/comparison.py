@@ -16,10 +16,10 @@ from lab.io.files import PartialFailure
 from lab.io.leader import go_on_alone
 from lab.methods.methods import Method
 from lab.options.options import Evaluation, Options
-from lab.reporting.rows import PLAYED, read_rows
+from lab.reporting.rows import PLAYED, RESULTS, read_rows, write_rows
 from lab.running.jobs import Job, Jobs
 from lab.running.measuring import measure
-from lab.running.policies import Cell, Policy, facts_of, play, row, train, write_rows
+from lab.running.policies import Cell, Policy, facts_of, play, row, train
 from warmprior.evaluation import Episode
 from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic
@@ -57,7 +57,7 @@ def compare(
         rows.sort(key=order)
         write_rows(path, rows)
 
-    path = options.run.folder / "results.jsonl"
+    path = options.run.folder / RESULTS
     rows = read_rows(path, PLAYED) if path.exists() else []
     if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(

@@ -7,7 +7,6 @@ options share it. A row is one JSON object in `results.jsonl`, with the results 
 from __future__ import annotations
 
 import json
-import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +17,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from filelock import FileLock
 from torchrl.envs import EnvBase
@@ -27,10 +25,9 @@ from torchrl.record.loggers import get_logger
 from lab.demonstrations.data_options import DataOptions, without_images
 from lab.demonstrations.tasks import load_task, longest_of, space_of, task_places, title_of
 from lab.measures.source_errors import mean_revision
-from lab.methods.methods import Method
+from lab.methods.methods import Method, code_digest
 from lab.options.options import Evaluation, Options, Run, with_parts
 from lab.options.stored_options import of_run, stored_options
-from lab.reporting.rows import read_rows
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import smoothness
 from warmprior.evaluation import Episode, play_episode
@@ -42,6 +39,7 @@ from warmprior.saving.checkpoint import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
+from warmprior.training.networks import own_network
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,7 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """Load the policy of averaged weights on the CPU, with this comparison's environment and grid."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
+        own_network(self.network)  # a worker process has not imported it
         # Runs with another time limit share the file.
         policy = load_policy(path).replace(environment=self.task().environment)
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
@@ -156,11 +155,12 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     """Return the policy of another method on a task, with the options of the policy `like`."""
+    network, own = asdict(like.network), own_network(like.network)
     identity = run_identity(
         task.identity,
         asdict(like.training),
         method=method.config(),
-        network=asdict(like.network),
+        network=network if own is None else network | {"code": code_digest(own)},
         device=like.run.device,
         compile=like.run.compile,
         versions={name: version(name) for name in ("torch", "warmprior")},
@@ -360,15 +360,3 @@ def row(
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),
     }
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Write or replace a file of rows, and return it as a table."""
-    # JSON has no NaN, so null stands for it.
-    finite = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-        for row in rows
-    ]
-    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in finite)
-    write_atomic(path, lambda path: path.write_text(text))
-    return pd.DataFrame(read_rows(path))

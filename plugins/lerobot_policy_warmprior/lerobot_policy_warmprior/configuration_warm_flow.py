@@ -19,7 +19,7 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
-from warmprior.options.train_command import DEFAULT_PRIOR, PRIOR_OF_TARGETS
+from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 

@@ -12,7 +12,7 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from warmprior import Prior
 from warmprior.lerobot import history_indices
 from warmprior.modules.registry import registered
-from warmprior.options.train_command import DEFAULT_PRIOR
+from warmprior.options.source import DEFAULT_PRIOR
 from warmprior.training.option_text import build
 
 OWN_PRIORS = (

@@ -14,8 +14,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from tensordict import TensorDict
 
-from warmprior.envs import RobosuiteEnv
-from warmprior.envs.tasks import get_task
+from warmprior.envs import RobosuiteEnv, get_task
 
 
 class RobosuiteGymEnv(gymnasium.Env):

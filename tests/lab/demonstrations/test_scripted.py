@@ -24,8 +24,8 @@ from lab.demonstrations.scripted.episode import (
 from lab.demonstrations.scripted.generate import generate_demonstrations
 from lab.demonstrations.scripted.motion import CLOSED, transfer
 from tests.errors import raises, refuses
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import make_simulator
-from warmprior.envs.tasks import TASKS
 
 
 def contents(path):

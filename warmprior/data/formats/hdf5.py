@@ -33,7 +33,7 @@ from warmprior.data.index import (
     store_finite,
     unknown_name_error,
 )
-from warmprior.envs.tasks import low_dim_keys, task_of_env
+from warmprior.envs.robosuite_tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 

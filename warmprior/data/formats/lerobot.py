@@ -26,8 +26,8 @@ from warmprior.data.formats.lerobot_index import (
     read_lerobot_index,
 )
 from warmprior.data.index import DatasetIndex, DemonstrationReader, reading, store_finite
+from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import task_env_args
-from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 
 DECODED = 2**26  # bytes of frames that are unpacked at once

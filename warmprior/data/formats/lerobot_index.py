@@ -20,7 +20,7 @@ from warmprior.data.index import (
     reading,
     unknown_name_error,
 )
-from warmprior.envs.tasks import TaskSpec, task_of_env
+from warmprior.envs.robosuite_tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
 from warmprior.lerobot.names import ROBOT_STATE, named_joints, short_names

@@ -14,8 +14,8 @@ from lab.demonstrations.scripted.motion import ArmRunner
 from lab.demonstrations.scripted.operators import LEVELS, OPERATORS, SKILLED, Demonstrator
 from lab.demonstrations.scripted.tasks import EXPERTS
 from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import make_simulator, task_env_args
-from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 

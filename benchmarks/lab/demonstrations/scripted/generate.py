@@ -23,8 +23,8 @@ from lab.demonstrations.scripted.operators import OPERATORS
 from lab.demonstrations.scripted.tasks import EXPERTS
 from lab.io.workers import available_cores, working
 from warmprior.envs.control_loop import ControlLoop
+from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import import_robosuite, task_env_args
-from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
 from warmprior.options.evaluation import EVALUATION_SEED

@@ -1,9 +1,9 @@
-"""Tables in pages: the marked ones of a page, and one per run whose rows it names."""
+"""Tables of pages: the marked ones of a page, and one per run whose rows it names."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,12 +17,6 @@ SLOPES = {"marginal": "over all data", "conditional": "given the observation", "
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
-
-PLAYED = re.compile(
-    r"(?<=<!-- )(rows|sigma|chunk|curvature|slope|forecasts|agents) (\w+)( -->\n).*?(?=<!-- end -->)", re.S
-)
-"""This matches the table of a run in a page: by NFE and noise, sigma, chunk length or
-slope, of curvature, of forecasts' errors, or of agents."""
 
 
 def played_table(name: str) -> str:
@@ -165,6 +159,21 @@ def agents_table(name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+KINDS: dict[str, Callable[[str], str]] = {
+    "rows": played_table,  # by NFE and noise
+    "sigma": partial(study_table, "sigma"),
+    "chunk": partial(study_table, "chunk"),
+    "slope": slope_table,
+    "curvature": curvature_table,
+    "forecasts": forecasts_table,
+    "agents": agents_table,
+}
+"""The tables of a run by their kind, which a page names before the run: ``<!-- KIND RUN -->``."""
+
+PLAYED = re.compile(rf"(?<=<!-- )({'|'.join(KINDS)}) (\w+)( -->\n).*?(?=<!-- end -->)", re.S)
+"""This matches the table of a run in a page."""
+
+
 def with_tables(page: str, tables: Sequence[str]) -> str:
     """Return a page with its tables, in their order, and those of the runs whose rows it names."""
     if len(places := TABLE.findall(page)) != len(tables):
@@ -173,10 +182,7 @@ def with_tables(page: str, tables: Sequence[str]) -> str:
 
     def table_of(match: re.Match[str]) -> str:
         kind, name, end = match.groups()
-        kinds = {"rows": played_table, "curvature": curvature_table, "slope": slope_table}
-        kinds |= {"forecasts": forecasts_table, "agents": agents_table}
-        drawn = kinds.get(kind, partial(study_table, kind))
-        return f"{kind} {name}{end}{drawn(name)}"
+        return f"{kind} {name}{end}{KINDS[kind](name)}"
 
     page = TABLE.sub(lambda _: next(texts), page)
     return PLAYED.sub(table_of, page)
