@@ -118,9 +118,8 @@ class PriorDecoder(TensorDictModuleBase):
         chunk_shape = (self.prediction_length, self.action_dim or anchor.shape[-1])
         check_shape(str(keys.ANCHOR), anchor, (*anchor.shape[:-2], *chunk_shape))
         check_shape(str(keys.DELTA), delta, (*anchor.shape[:-2], self.residual_length, anchor.shape[-1]))
-        noise = anchor + held(delta, self.prediction_length).to(
-            anchor.dtype
-        )  # in the environment's precision
+        residual = held(delta, self.prediction_length)
+        noise = anchor + residual.to(anchor.dtype)  # in the environment's precision
         inputs = tensordict.select(self.observation_key).set(keys.NOISE, noise)
         return tensordict.update(self.ode(inputs).select(*self.out_keys_source))
 
