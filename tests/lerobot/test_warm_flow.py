@@ -388,10 +388,36 @@ JOINTS = ["pan", "lift", "gripper"]
 
 
 def joint_dataset(root, names=JOINTS, near=True):
-    """Episodes whose actions are the joints that the state reads, or other numbers of the same names."""
+    """Episodes whose actions are a little above the joints that the state reads, or are other numbers."""
     state = numbers(3) | {"names": list(JOINTS)}
     features = {"observation.state": state, "action": numbers(3) | {"names": list(names)}}
-    return write_lerobot(root, (12, 12, 12), features, same=["action"] if near else [])
+    values = write_lerobot(root, (12, 12, 12), features, same=["action"] if near else [])
+    (file,) = root.glob("data/*/*.parquet")
+    below = values["observation.state"] - np.float32(0.01)
+    edit_table(file, observation__state=lambda _: list(below))
+    return values | {"observation.state": below}
+
+
+def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(found, tmp_path, caplog):
+    """As by ``train``; LeRobot fills in all features only where the options name none."""
+    features = {name: numbers(3) for name in ("observation.state", "action", "observation.goal")}
+    write_lerobot(tmp_path / "data", (12, 12), features, same=["observation.goal"])
+    words = ("'observation.goal'", "of the same step", "--policy.input_features", "(observation.state)")
+    for options in ({}, {"precondition": False}):
+        with raises(ValueError, *words):
+            dataset_policy(found, tmp_path / "data", **options)
+    policy, dataset = dataset_policy(found, tmp_path / "data", joints="observation.goal")
+    named = {"input_features": policy.config.input_features}
+    assert policy.config.observed == ["observation.state", "observation.goal"]
+    dataset_policy(found, tmp_path / "data", **named)
+    (tmp_path / "data/data").rename(tmp_path / "on the hub")
+    kind = found["warm_flow"]
+    for given, warned in (({}, True), (named, False)):
+        caplog.clear()
+        config = kind.config_class(precondition=False, embedding_dim=24, num_layers=1, device="cpu", **given)
+        config.input_features, config.output_features = named["input_features"], policy.config.output_features
+        kind(config, dataset_meta=dataset.meta)  # as from the factory, whose dataset fetches its steps later
+        assert ("its own target" in caplog.text) is warned
 
 
 def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, tmp_path):
@@ -399,9 +425,10 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     values = joint_dataset(tmp_path / "data")
     policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, prior="past")
     assert policy.config.joints == "observation.state"
-    low, high = (torch.as_tensor(values["action"]).float().aminmax(dim=0)[i] for i in (0, 1))
-    scaled = 2 * (torch.as_tensor(values["action"]).float() - low) / (high - low) - 1
-    steps = {"observation": scaled, "action": scaled, "episode": torch.arange(36) // 12}
+    low, high = torch.as_tensor(values["action"]).aminmax(dim=0)  # the statistics of both
+    steps = {"observation": values["observation.state"], "action": values["action"]}
+    steps = {name: 2 * (torch.as_tensor(value) - low) / (high - low) - 1 for name, value in steps.items()}
+    steps["episode"] = torch.arange(36) // 12
     sizes = (3, 3, 4, policy.config.n_obs_steps)
     ends = ({"observation": end, "action": end} for end in (low, high))
     rest = RestingJoints([0, 1, 2], Normalizer(*ends))
@@ -425,8 +452,6 @@ def test_the_default_source_is_that_of_train(found, tmp_path, near, prior, capsy
     """The data decide, after LeRobot asked which steps to load."""
     root = tmp_path / "data"
     joint_dataset(root, near=near)
-    (file,) = root.glob("data/*/*.parquet")  # train refuses a state that is the action
-    edit_table(file, observation__state=lambda rows: [np.float32(row) - np.float32(0.01) for row in rows])
     loaded = found["warm_flow"].config_class(n_action_steps=4).action_delta_indices
     caplog.set_level("INFO")
     policy, _ = dataset_policy(found, root, n_action_steps=4)

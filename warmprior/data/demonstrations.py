@@ -180,11 +180,13 @@ class Demonstrations:
         """Return the rendering options of the images, and the first simulator state, if they are known."""
         return None, None
 
-    def check_targets(self, index: DatasetIndex, steps: TensorDictBase, named: Any = None) -> None:
+    def check_targets(
+        self, index: DatasetIndex, steps: TensorDictBase, named: Any = None, *, option: str = "observations"
+    ) -> None:
         """Check all observations but the named one: none may hold an action of the same or a later step.
 
         A number that equals one dimension of the action at every step, and changes, is refused. A state that
-        reaches the last target equals an earlier action.
+        reaches the last target equals an earlier action. The error tells the ``option`` that chooses.
         """
         keys, first = np.repeat(index.observation_keys, index.observation_dims).tolist(), steps[:ROWS]
         seen, action, episode = vector_of(first[OBSERVATION]), first[ACTION], first[EPISODE]
@@ -199,7 +201,7 @@ class Demonstrations:
                     when = f"{later} steps later" if later else "of the same step"
                     raise DatasetError(
                         f"{self}: the observation {held[0]!r} holds the action {when}, its own target: "
-                        f"name observations without it ({', '.join(others) or 'none'}), or with it to keep it"
+                        f"name {option} without it ({', '.join(others) or 'none'}), or with it to keep it"
                     )
 
     def digest(self, index: DatasetIndex) -> str:

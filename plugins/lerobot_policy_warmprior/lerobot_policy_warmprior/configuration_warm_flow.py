@@ -104,6 +104,8 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # LeRobot fills in all features of a dataset later, but only where there are none yet.
+        self.names_observations = bool(self.input_features)
         if self.prior_chunk is None:  # saved as well, so that fewer actions can be executed later
             self.prior_chunk = self.n_action_steps
 
