@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
+from tests.data.lerobot_parts import WIDTHS, edit_table, numbers, write_lerobot
 from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
@@ -20,7 +20,9 @@ from warmprior import (
 )
 from warmprior.__main__ import main
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.deploy import AsyncExecutor
 from warmprior.history import cold_history
+from warmprior.modules.recording import Recording
 from warmprior.modules.resize import resized
 from warmprior.saving import load_policy
 from warmprior.training import precondition
@@ -149,6 +151,36 @@ def test_a_training_says_what_it_uses_of_the_dataset(found, tmp_path, caplog):
             dataset_policy(found, tmp_path / "data", input_features=blind, **options)
     with raises(ValueError, "--policy.resize", "squeeze", "pad", "crop"):
         dataset_policy(found, tmp_path / "data", resize="crop")
+
+
+def test_the_executor_takes_the_names_and_the_rate_of_the_dataset(found, tmp_path):
+    from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
+    from lerobot_policy_warmprior.robot import load_actor
+
+    root, place = tmp_path / "data", tmp_path / "policy"
+    write_lerobot(root, (12, 12), images=[("front", "image"), ("side", "image")], fps=30)
+    sizes = {"encoder": "small", "image_size": 24, "crop_size": 16}
+    policy, dataset = dataset_policy(found, root, n_action_steps=4, **sizes)
+    stirred(policy.actor.network)
+    policy.save_pretrained(place)
+    for pipeline in make_warm_flow_pre_post_processors(policy.config, dataset.meta.stats):
+        pipeline.save_pretrained(place)
+    actor, rng = load_actor(place), np.random.default_rng(0)
+    theirs = {name: rng.normal(size=width) for name, width in WIDTHS.items() if name != "action"}
+    ours = {"state": np.concatenate([*theirs.values()])}
+    for camera in ("front", "side"):
+        ours[camera] = rng.integers(0, 256, (48, 64, 3), np.uint8)
+        theirs[f"observation.images.{camera}"] = ours[camera]
+    actions = []
+    for observation in (ours, theirs):
+        torch.manual_seed(0)
+        with AsyncExecutor(actor, latency=0, control_rate=29.97) as executor:
+            actions.append(executor.act(observation))
+    assert torch.equal(*actions) and actions[0].std() > 0
+    refuses(lambda: AsyncExecutor(actor, control_rate=50), ValueError, "control_rate=50", 30)
+    config = json.loads((place / "config.json").read_text()) | {"recording": '{"rate": -1}'}
+    (place / "config.json").write_text(json.dumps(config))
+    refuses(lambda: load_actor(place), ValueError, place, "cannot be built")
 
 
 def test_features_of_width_1(found, tmp_path):
@@ -315,7 +347,9 @@ def saved_policy(folder, **options):
     width = HistoryObservation.width(8, 7) if seen else 0
     network = stirred(VelocityMLP(7, OBJECT + STATE + width, 8), by=0.05)
     environment = environment_description(task_env_args("lift"), "ph")
+    recording = Recording("lift", 2, 50, "[7]", {"object": OBJECT, "robot": STATE}, rate=20)
     chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
+    chosen |= {"recording": recording}
     actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
     save_policy(actor, folder)
     return actor
@@ -325,12 +359,14 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     pytest.importorskip("robosuite")
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot_policy_warmprior.export import export_policy, main
+    from lerobot_policy_warmprior.robot import load_actor
 
     actor = saved_policy(tmp_path / "ours")
     out = export_policy(tmp_path / "ours", tmp_path / "theirs")
     policy = found["warm_flow"].from_pretrained(out)
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(out))
     assert policy.actor.prior.config() == actor.prior.config()
+    assert load_actor(out).recording == actor.recording
     raw = torch.randn(OBJECT + STATE)
     seen = {"observation.environment_state": raw[:OBJECT], "observation.state": raw[OBJECT:]}
     torch.manual_seed(7)

@@ -7,6 +7,7 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any, Literal, cast
 
 import torch
@@ -155,6 +156,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         if dataset_meta is not None:
             used = recording_of(config, dataset_meta, training_episodes(dataset_meta))
             logging.info("%s\n%-13s %s (--policy.prior)", used.text("--policy.{}"), "source", config.prior)
+            config.recording = json.dumps(asdict(used))
         # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
         # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
@@ -164,6 +166,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             execute=config.n_action_steps,
             nfe=config.nfe,
             clip=1.0 if spans else None,
+            recording=config.make_recording(),
         )
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
