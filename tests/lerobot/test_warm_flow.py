@@ -474,6 +474,7 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     policy.save_pretrained(tmp_path / "policy")
     again = found["warm_flow"].from_pretrained(tmp_path / "policy")
     assert again.config.joints == "observation.state"
+    assert again.actor.recording.numbers == {"observation.state": JOINTS, "action": JOINTS}
     batch = {"observation.state": torch.randn(2, 3)}
     chunks = []
     for one in (policy, again):

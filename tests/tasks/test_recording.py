@@ -206,6 +206,8 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
 
     widths = {"observation.effort": 2, "observation.state": 6, "action": 6}
     features = {name: numbers(width) for name, width in widths.items()}
+    features["observation.state"]["names"] = JOINTS
+    features["action"]["names"] = {"motors": JOINTS[::-1]}
     write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
     words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
     words += " --observations observation.state observation.effort --images observation.images.front"
@@ -218,6 +220,9 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert not missing(said["takes"], "state (8,)", "front_image", "any size", "32 x 32")
     assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
     assert not missing(said["data"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
+    ordered = ", ".join(JOINTS), ", ".join(JOINTS[::-1])
+    assert said["numbers"] == "observation.state: {}; action: {}".format(*ordered)
+    assert "units of the demonstrations" in said["normaliser"]
 
     policy, rng = load_policy(folder), np.random.default_rng(0)
     state, effort = rng.normal(size=6), rng.normal(size=2).astype(np.float32)

@@ -122,6 +122,7 @@ class Demonstrations:
             {key: index.images[key] for key in index.image_keys if key in index.images},
             index.left_out,
             index.rate,
+            numbers=index.numbers,
         )
 
     def first(self, demos: int) -> Self:
