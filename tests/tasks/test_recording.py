@@ -234,8 +234,10 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
         torch.manual_seed(0)
         with AsyncExecutor(policy, latency=0, control_rate=29.97) as executor:
             actions.append(executor.act(observation))
-            with raises(KeyError, "front_image"):
-                executor.act({name: value for name, value in observation.items() if "front" not in name})
+            for entry in ("front", "state"):
+                part = {name: value for name, value in observation.items() if entry not in name}
+                with raises(KeyError, "front_image", "observation.images.front", "observation.effort"):
+                    executor.act(part)
     assert torch.equal(*actions)
     with raises(ValueError, "observation.state", 6), AsyncExecutor(policy, latency=0) as executor:
         executor.act(theirs | {"observation.state": effort})
