@@ -76,6 +76,12 @@ def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
 
 
+@pytest.mark.parametrize("options", [{"image_size": 4}, {"resize": "pad"}])
+def test_a_size_of_images_without_images_is_refused(tmp_path, options):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), **options)
+    refuses(lambda: Task(demonstrations), ValueError, "image_size and resize", "images")
+
+
 def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
     path = robot_file(tmp_path / "arm.hdf5")
     options = {"network": NetworkOptions(hidden_dim=8), "training": TrainingConfig(iterations=1)}
@@ -132,6 +138,10 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp
     with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
         Task(demonstrations)
     refuses(lambda: Task(demonstrations, joints="robot0_eef_pos"), DatasetError, f"'{name}'")
+    others = {other: make for other, make in SEEN.items() if other != name}
+    several = open_demonstrations(robot_file(tmp_path / "several.hdf5", **others))
+    with raises(DatasetError, *map(repr, others), "(robot0_eef_pos, robot0_gripper_qpos, force)"):
+        Task(several)  # what it advises holds none of them
     named = ["robot0_eef_pos", name]
     assert list(Task(demonstrations, observations=named).recording.observations) == named
 

@@ -191,19 +191,25 @@ class Demonstrations:
         """
         keys, first = np.repeat(index.observation_keys, index.observation_dims).tolist(), steps[:ROWS]
         seen, action, episode = vector_of(first[OBSERVATION]), first[ACTION], first[EPISODE]
+        found: dict[str, int] = {}
         # So that half of the steps are compared at least.
         for later in range(min(LATER, 1 + min(index.lengths) // 2)):
             rows = episode[later:] == episode[: len(episode) - later]
             now, then = seen[: len(rows)][rows], action[later:][rows]
             for target in then.mT[(then != then[:1]).any(0)]:
                 equal = (now == target.unsqueeze(-1)).all(0).tolist()
-                if held := [key for key, same in zip(keys, equal, strict=True) if same and key != named]:
-                    others = [key for key in index.observation_keys if key not in held]
-                    when = f"{later} steps later" if later else "of the same step"
-                    raise DatasetError(
-                        f"{self}: the observation {held[0]!r} holds the action {when}, its own target: "
-                        f"name {option} without it ({', '.join(others) or 'none'}), or with it to keep it"
-                    )
+                for key in (key for key, same in zip(keys, equal, strict=True) if same and key != named):
+                    found.setdefault(key, later)
+        if found:
+            others = [key for key in index.observation_keys if key not in found]
+            held = " and ".join(
+                f"{key!r} holds the action {f'{later} steps later' if later else 'of the same step'}"
+                for key, later in found.items()
+            )
+            raise DatasetError(
+                f"{self}: the observation {held}, its own target: "
+                f"name {option} without it ({', '.join(others) or 'none'}), or with it to keep it"
+            )
 
     def digest(self, index: DatasetIndex) -> str:
         """Return the SHA-256 of the contents, and of the mask."""
