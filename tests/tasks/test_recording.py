@@ -66,6 +66,13 @@ def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
     assert line in capsys.readouterr().out
 
 
+def test_an_image_that_is_not_there_is_named_beside_those_that_are(tmp_path):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"))
+    with raises(DatasetError, "demo_0", "'side'", "wrist") as refused:
+        Task(demonstrations, images=["wrist", "side"])
+    assert "depth" not in str(refused.value)
+
+
 def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
     task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
