@@ -203,7 +203,7 @@ class Demonstrations:
         if found:
             others = [key for key in index.observation_keys if key not in found]
             held = " and ".join(
-                f"{key!r} holds the action {f'{later} steps later' if later else 'of the same step'}"
+                f"{key!r} holds the action {f'of step t + {later}' if later else 'of the same step'}"
                 for key, later in found.items()
             )
             raise DatasetError(
