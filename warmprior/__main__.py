@@ -70,16 +70,19 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     count, recording = sum(p.numel() for p in actor.parameters()), actor.recording
     shapes, sampling, guidance = observation_shapes(actor), actor.sampling, actor.ode.guidance
     networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
+    named = {} if recording is None else recording.numbers
+    numbers = "; ".join(f"{name}: {', '.join(names)}" for name, names in named.items())
     file = policy_file(folder, revision=revision)
     for name, value in {
         "takes": "unknown" if shapes is None else ", ".join(map(_wanted, shapes, shapes.values())),
         **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
+        **({"numbers": numbers} if numbers else {}),
         "source": actor.prior,
         "start": actor.start or "the source",
         "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid",
         **given(temperature=sampling.temperature, guidance=guidance),
         "network": f"{', '.join(networks)} ({count:,} parameters)",
-        "normaliser": "kept" if actor.normalizer is not None else "none",
+        "normaliser": "none" if actor.normalizer is None else "kept: all in the units of the demonstrations",
         "environment": environment_name(actor) or "not kept",
         "written by": f"warmprior {file['warmprior']}, format {file['format']}",
     }.items():

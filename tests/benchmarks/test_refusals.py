@@ -2,6 +2,8 @@
 
 import importlib
 
+import h5py
+import numpy as np
 import pytest
 
 from tests.benchmarks.script_parts import refused
@@ -122,6 +124,22 @@ def test_an_environment_that_cannot_be_built_is_refused_before_training(
     line = refused(importlib.import_module(script).main, argv, capsys)
     assert not missing(line, fact, "own.hdf5"), line
     assert not list(tmp_path.glob("policies/*"))
+
+
+@pytest.mark.parametrize("preset", ["quick", "cpu"])
+def test_a_robots_own_file_is_refused_before_its_images_are_read(
+    preset, no_work, tmp_path, capsys, monkeypatch
+):
+    """It names no environment to play in, whatever options of images a preset has."""
+    path, frames = tmp_path / "arm.hdf5", np.zeros((20, 48, 64, 3), np.uint8)
+    with h5py.File(path, "w") as file:
+        demo = {"actions": np.eye(20, 2), "obs/joints": np.eye(20, 3), "obs/wrist": frames}
+        for name, value in demo.items():
+            file[f"data/demo_0/{name}"] = value
+    monkeypatch.delattr("warmprior.data.formats.hdf5.RobomimicReader.images")
+    words = f"--dataset {path} --images wrist --preset {preset} --out {tmp_path / 'out'}"
+    line = refused(importlib.import_module("robomimic").main, words.split(), capsys)
+    assert not missing(line, "arm.hdf5", "which environment", "python -m warmprior train"), line
 
 
 @pytest.mark.parametrize(

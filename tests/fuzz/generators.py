@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
@@ -43,6 +43,7 @@ from warmprior import (
     WarmPriorActor,
 )
 from warmprior.history import cold_history
+from warmprior.modules.recording import Recording
 from warmprior.saving.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.saving.policies import load_policy, policy_config, save_policy
 
@@ -198,7 +199,9 @@ class Subject:
 
 
 def make_plugin(folder: Path) -> None:
-    flow_policy({"warm_flow": WarmFlowPolicy}).save_pretrained(folder / "whole")
+    seen = {"observation.environment_state": 2, "observation.state": 3}
+    recording = json.dumps(asdict(Recording("arm", 2, 60, "[2], as recorded", seen, rate=30)))
+    flow_policy({"warm_flow": WarmFlowPolicy}, recording=recording).save_pretrained(folder / "whole")
 
 
 def mutate_plugin(folder: Path, rng: np.random.Generator) -> Case:

@@ -113,6 +113,16 @@ def test_a_configuration_of_which_nothing_can_be_built(found, saved, tmp_path, o
     refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "cannot be built")
 
 
+def test_weights_of_another_size_are_named_in_one_line(found, saved, tmp_path):
+    """As where a configuration lost an option, whose default is another."""
+    saved("warm_flow")
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"embedding_dim": 48}))
+    with raises(ValueError, tmp_path, "size mismatch", "action_position", "...") as refused:
+        load(found, "warm_flow", tmp_path)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, saved, tmp_path):
     saved("warm_flow")
     config = json.loads((tmp_path / "config.json").read_text())

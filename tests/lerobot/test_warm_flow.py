@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
+from tests.data.lerobot_parts import WIDTHS, edit_table, numbers, write_lerobot
 from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, flow_batch, flow_policy, one_observation
 from tests.toy_env import Halfway, stirred
@@ -20,7 +20,9 @@ from warmprior import (
 )
 from warmprior.__main__ import main
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.deploy import AsyncExecutor
 from warmprior.history import cold_history
+from warmprior.modules.recording import Recording
 from warmprior.modules.resize import resized
 from warmprior.saving import load_policy
 from warmprior.training import precondition
@@ -149,6 +151,36 @@ def test_a_training_says_what_it_uses_of_the_dataset(found, tmp_path, caplog):
             dataset_policy(found, tmp_path / "data", input_features=blind, **options)
     with raises(ValueError, "--policy.resize", "squeeze", "pad", "crop"):
         dataset_policy(found, tmp_path / "data", resize="crop")
+
+
+def test_the_executor_takes_the_names_and_the_rate_of_the_dataset(found, tmp_path):
+    from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
+    from lerobot_policy_warmprior.robot import load_actor
+
+    root, place = tmp_path / "data", tmp_path / "policy"
+    write_lerobot(root, (12, 12), images=[("front", "image"), ("side", "image")], fps=30)
+    sizes = {"encoder": "small", "image_size": 24, "crop_size": 16}
+    policy, dataset = dataset_policy(found, root, n_action_steps=4, **sizes)
+    stirred(policy.actor.network)
+    policy.save_pretrained(place)
+    for pipeline in make_warm_flow_pre_post_processors(policy.config, dataset.meta.stats):
+        pipeline.save_pretrained(place)
+    actor, rng = load_actor(place), np.random.default_rng(0)
+    theirs = {name: rng.normal(size=width) for name, width in WIDTHS.items() if name != "action"}
+    ours = {"state": np.concatenate([*theirs.values()])}
+    for camera in ("front", "side"):
+        ours[camera] = rng.integers(0, 256, (48, 64, 3), np.uint8)
+        theirs[f"observation.images.{camera}"] = ours[camera]
+    actions = []
+    for observation in (ours, theirs):
+        torch.manual_seed(0)
+        with AsyncExecutor(actor, latency=0, control_rate=29.97) as executor:
+            actions.append(executor.act(observation))
+    assert torch.equal(*actions) and actions[0].std() > 0
+    refuses(lambda: AsyncExecutor(actor, control_rate=50), ValueError, "control_rate=50", 30)
+    config = json.loads((place / "config.json").read_text()) | {"recording": '{"rate": -1}'}
+    (place / "config.json").write_text(json.dumps(config))
+    refuses(lambda: load_actor(place), ValueError, place, "cannot be built")
 
 
 def test_features_of_width_1(found, tmp_path):
@@ -315,7 +347,9 @@ def saved_policy(folder, **options):
     width = HistoryObservation.width(8, 7) if seen else 0
     network = stirred(VelocityMLP(7, OBJECT + STATE + width, 8), by=0.05)
     environment = environment_description(task_env_args("lift"), "ph")
+    recording = Recording("lift", 2, 50, "[7]", {"object": OBJECT, "robot": STATE}, rate=20)
     chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
+    chosen |= {"recording": recording}
     actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
     save_policy(actor, folder)
     return actor
@@ -325,12 +359,14 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     pytest.importorskip("robosuite")
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot_policy_warmprior.export import export_policy, main
+    from lerobot_policy_warmprior.robot import load_actor
 
     actor = saved_policy(tmp_path / "ours")
     out = export_policy(tmp_path / "ours", tmp_path / "theirs")
     policy = found["warm_flow"].from_pretrained(out)
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(out))
     assert policy.actor.prior.config() == actor.prior.config()
+    assert load_actor(out).recording == actor.recording
     raw = torch.randn(OBJECT + STATE)
     seen = {"observation.environment_state": raw[:OBJECT], "observation.state": raw[OBJECT:]}
     torch.manual_seed(7)
@@ -388,10 +424,36 @@ JOINTS = ["pan", "lift", "gripper"]
 
 
 def joint_dataset(root, names=JOINTS, near=True):
-    """Episodes whose actions are the joints that the state reads, or other numbers of the same names."""
+    """Episodes whose actions are a little above the joints that the state reads, or are other numbers."""
     state = numbers(3) | {"names": list(JOINTS)}
     features = {"observation.state": state, "action": numbers(3) | {"names": list(names)}}
-    return write_lerobot(root, (12, 12, 12), features, same=["action"] if near else [])
+    values = write_lerobot(root, (12, 12, 12), features, same=["action"] if near else [])
+    (file,) = root.glob("data/*/*.parquet")
+    below = values["observation.state"] - np.float32(0.01)
+    edit_table(file, observation__state=lambda _: list(below))
+    return values | {"observation.state": below}
+
+
+def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(found, tmp_path, caplog):
+    """As by ``train``; LeRobot fills in all features only where the options name none."""
+    features = {name: numbers(3) for name in ("observation.state", "action", "observation.goal")}
+    write_lerobot(tmp_path / "data", (12, 12), features, same=["observation.goal"])
+    words = ("'observation.goal'", "of the same step", "--policy.input_features", "(observation.state)")
+    for options in ({}, {"precondition": False}):
+        with raises(ValueError, *words):
+            dataset_policy(found, tmp_path / "data", **options)
+    policy, dataset = dataset_policy(found, tmp_path / "data", joints="observation.goal")
+    named = {"input_features": policy.config.input_features}
+    assert policy.config.observed == ["observation.state", "observation.goal"]
+    dataset_policy(found, tmp_path / "data", **named)
+    (tmp_path / "data/data").rename(tmp_path / "on the hub")
+    kind = found["warm_flow"]
+    for given, warned in (({}, True), (named, False)):
+        caplog.clear()
+        config = kind.config_class(precondition=False, embedding_dim=24, num_layers=1, device="cpu", **given)
+        config.input_features, config.output_features = named["input_features"], policy.config.output_features
+        kind(config, dataset_meta=dataset.meta)  # as from the factory, whose dataset fetches its steps later
+        assert ("its own target" in caplog.text) is warned
 
 
 def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, tmp_path):
@@ -399,9 +461,10 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     values = joint_dataset(tmp_path / "data")
     policy, _ = dataset_policy(found, tmp_path / "data", n_action_steps=4, prior="past")
     assert policy.config.joints == "observation.state"
-    low, high = (torch.as_tensor(values["action"]).float().aminmax(dim=0)[i] for i in (0, 1))
-    scaled = 2 * (torch.as_tensor(values["action"]).float() - low) / (high - low) - 1
-    steps = {"observation": scaled, "action": scaled, "episode": torch.arange(36) // 12}
+    low, high = torch.as_tensor(values["action"]).aminmax(dim=0)  # the statistics of both
+    steps = {"observation": values["observation.state"], "action": values["action"]}
+    steps = {name: 2 * (torch.as_tensor(value) - low) / (high - low) - 1 for name, value in steps.items()}
+    steps["episode"] = torch.arange(36) // 12
     sizes = (3, 3, 4, policy.config.n_obs_steps)
     ends = ({"observation": end, "action": end} for end in (low, high))
     rest = RestingJoints([0, 1, 2], Normalizer(*ends))
@@ -411,6 +474,7 @@ def test_joint_targets_are_recognised_and_learnt_from_where_the_robot_is(found, 
     policy.save_pretrained(tmp_path / "policy")
     again = found["warm_flow"].from_pretrained(tmp_path / "policy")
     assert again.config.joints == "observation.state"
+    assert again.actor.recording.numbers == {"observation.state": JOINTS, "action": JOINTS}
     batch = {"observation.state": torch.randn(2, 3)}
     chunks = []
     for one in (policy, again):
@@ -425,8 +489,6 @@ def test_the_default_source_is_that_of_train(found, tmp_path, near, prior, capsy
     """The data decide, after LeRobot asked which steps to load."""
     root = tmp_path / "data"
     joint_dataset(root, near=near)
-    (file,) = root.glob("data/*/*.parquet")  # train refuses a state that is the action
-    edit_table(file, observation__state=lambda rows: [np.float32(row) - np.float32(0.01) for row in rows])
     loaded = found["warm_flow"].config_class(n_action_steps=4).action_delta_indices
     caplog.set_level("INFO")
     policy, _ = dataset_policy(found, root, n_action_steps=4)

@@ -66,6 +66,13 @@ def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
     assert line in capsys.readouterr().out
 
 
+def test_an_image_that_is_not_there_is_named_beside_those_that_are(tmp_path):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"))
+    with raises(DatasetError, "demo_0", "'side'", "wrist") as refused:
+        Task(demonstrations, images=["wrist", "side"])
+    assert "depth" not in str(refused.value)
+
+
 def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
     task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
@@ -74,6 +81,12 @@ def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     assert recording.left_out["observations"] == ["robot0_eef_pos", "robot0_gripper_qpos"]
     assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "4 x 4")
     assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
+
+
+@pytest.mark.parametrize("options", [{"image_size": 4}, {"resize": "pad"}])
+def test_a_size_of_images_without_images_is_refused(tmp_path, options):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), **options)
+    refuses(lambda: Task(demonstrations), ValueError, "image_size and resize", "images")
 
 
 def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
@@ -132,6 +145,10 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp
     with raises(DatasetError, "arm.hdf5", f"'{name}'", "observations", "robot0_eef_pos"):
         Task(demonstrations)
     refuses(lambda: Task(demonstrations, joints="robot0_eef_pos"), DatasetError, f"'{name}'")
+    others = {other: make for other, make in SEEN.items() if other != name}
+    several = open_demonstrations(robot_file(tmp_path / "several.hdf5", **others))
+    with raises(DatasetError, *map(repr, others), "(robot0_eef_pos, robot0_gripper_qpos, force)"):
+        Task(several)  # what it advises holds none of them
     named = ["robot0_eef_pos", name]
     assert list(Task(demonstrations, observations=named).recording.observations) == named
 
@@ -206,6 +223,8 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
 
     widths = {"observation.effort": 2, "observation.state": 6, "action": 6}
     features = {name: numbers(width) for name, width in widths.items()}
+    features["observation.state"]["names"] = JOINTS
+    features["action"]["names"] = {"motors": JOINTS[::-1]}
     write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
     words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
     words += " --observations observation.state observation.effort --images observation.images.front"
@@ -218,6 +237,9 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert not missing(said["takes"], "state (8,)", "front_image", "any size", "32 x 32")
     assert not missing(said["images"], "front_image, 32 x 32") and not missing(said["rate"], 30)
     assert not missing(said["data"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
+    ordered = ", ".join(JOINTS), ", ".join(JOINTS[::-1])
+    assert said["numbers"] == "observation.state: {}; action: {}".format(*ordered)
+    assert "units of the demonstrations" in said["normaliser"]
 
     policy, rng = load_policy(folder), np.random.default_rng(0)
     state, effort = rng.normal(size=6), rng.normal(size=2).astype(np.float32)
@@ -229,8 +251,10 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
         torch.manual_seed(0)
         with AsyncExecutor(policy, latency=0, control_rate=29.97) as executor:
             actions.append(executor.act(observation))
-            with raises(KeyError, "front_image"):
-                executor.act({name: value for name, value in observation.items() if "front" not in name})
+            for entry in ("front", "state"):
+                part = {name: value for name, value in observation.items() if entry not in name}
+                with raises(KeyError, "front_image", "observation.images.front", "observation.effort"):
+                    executor.act(part)
     assert torch.equal(*actions)
     with raises(ValueError, "observation.state", 6), AsyncExecutor(policy, latency=0) as executor:
         executor.act(theirs | {"observation.state": effort})

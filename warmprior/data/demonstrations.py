@@ -122,6 +122,7 @@ class Demonstrations:
             {key: index.images[key] for key in index.image_keys if key in index.images},
             index.left_out,
             index.rate,
+            numbers=index.numbers,
         )
 
     def first(self, demos: int) -> Self:
@@ -180,27 +181,35 @@ class Demonstrations:
         """Return the rendering options of the images, and the first simulator state, if they are known."""
         return None, None
 
-    def check_targets(self, index: DatasetIndex, steps: TensorDictBase, named: Any = None) -> None:
+    def check_targets(
+        self, index: DatasetIndex, steps: TensorDictBase, named: Any = None, *, option: str = "observations"
+    ) -> None:
         """Check all observations but the named one: none may hold an action of the same or a later step.
 
         A number that equals one dimension of the action at every step, and changes, is refused. A state that
-        reaches the last target equals an earlier action.
+        reaches the last target equals an earlier action. The error tells the ``option`` that chooses.
         """
         keys, first = np.repeat(index.observation_keys, index.observation_dims).tolist(), steps[:ROWS]
         seen, action, episode = vector_of(first[OBSERVATION]), first[ACTION], first[EPISODE]
+        found: dict[str, int] = {}
         # So that half of the steps are compared at least.
         for later in range(min(LATER, 1 + min(index.lengths) // 2)):
             rows = episode[later:] == episode[: len(episode) - later]
             now, then = seen[: len(rows)][rows], action[later:][rows]
             for target in then.mT[(then != then[:1]).any(0)]:
                 equal = (now == target.unsqueeze(-1)).all(0).tolist()
-                if held := [key for key, same in zip(keys, equal, strict=True) if same and key != named]:
-                    others = [key for key in index.observation_keys if key not in held]
-                    when = f"{later} steps later" if later else "of the same step"
-                    raise DatasetError(
-                        f"{self}: the observation {held[0]!r} holds the action {when}, its own target: "
-                        f"name observations without it ({', '.join(others) or 'none'}), or with it to keep it"
-                    )
+                for key in (key for key, same in zip(keys, equal, strict=True) if same and key != named):
+                    found.setdefault(key, later)
+        if found:
+            others = [key for key in index.observation_keys if key not in found]
+            held = " and ".join(
+                f"{key!r} holds the action {f'of step t + {later}' if later else 'of the same step'}"
+                for key, later in found.items()
+            )
+            raise DatasetError(
+                f"{self}: the observation {held}, its own target: "
+                f"name {option} without it ({', '.join(others) or 'none'}), or with it to keep it"
+            )
 
     def digest(self, index: DatasetIndex) -> str:
         """Return the SHA-256 of the contents, and of the mask."""

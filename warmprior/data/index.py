@@ -99,6 +99,11 @@ class DatasetIndex:
         check_distinct(f"{self.path}: the observations", (*self.observation_keys, *self.image_keys))
 
     @property
+    def numbers(self) -> dict[str, list[str]]:
+        """The place's own names of the numbers of observations, and of the action, if they have some."""
+        return {}
+
+    @property
     def left_out(self) -> dict[str, list[str]]:
         """The observations that are not read, by the option that would take them."""
         others: dict[str, list[str]] = {}

@@ -107,10 +107,14 @@ class RobotObservation:
                 )
             observation = dict.fromkeys(self.shapes, observation)
         given = {name: value for name, value in observation.items() if value is not None}
-        given = given if self.recording is None else self._renamed(given, self.recording)
+        there = f"; there are {sorted(map(str, given))}"
+        if self.recording is not None:
+            own = {keys.STATE: [*self.recording.observations], **self.recording.names}
+            there += f"; the demonstrations' own names are {own}"
+            given = self._renamed(given, self.recording)
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
         given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
-        check_keys(given, self.shapes, "the policy", f"; there are {sorted(map(str, given))}")
+        check_keys(given, self.shapes, "the policy", there)
         entries = {
             name: _fitted(name, given[name], shape, self.resize) for name, shape in self.shapes.items()
         }

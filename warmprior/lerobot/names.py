@@ -44,6 +44,24 @@ def entry_names(features: Iterable[str]) -> dict[str, str]:
     return {short: name for name, short in named.items()}
 
 
+def number_names(feature: Mapping[str, Any]) -> list[str]:
+    """Return a feature's names of its numbers, empty if it does not name each.
+
+    Examples:
+        >>> from warmprior.lerobot.names import number_names
+        >>> number_names({"shape": [2], "names": ["pan", "lift"]})
+        ['pan', 'lift']
+        >>> number_names({"shape": [2], "names": {"motors": ["pan", "lift"]}}), number_names({"shape": [2]})
+        (['pan', 'lift'], [])
+    """
+    names = feature.get("names")
+    if isinstance(names, Mapping) and len(names) == 1:
+        (names,) = names.values()
+    if not isinstance(names, list | tuple) or [len(names)] != [*feature["shape"]]:
+        return []
+    return [*names] if all(isinstance(name, str) for name in names) else []
+
+
 def named_joints(features: Mapping[str, Any], observed: Container[str]) -> str:
     """Return the observation with the same names as the actions, which may be its absolute targets.
 

@@ -39,6 +39,7 @@ class Recording:
         left_out: what the policy does not see, by the option that would take it, or under no name.
         rate: control steps per second, if they are known.
         held_out: number of further demonstrations that are held out.
+        numbers: the dataset's own names of the numbers of observations, and of ``"action"``, in their order.
 
     Raises:
         ValueError: if an entry has another form.
@@ -65,12 +66,14 @@ class Recording:
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
     rate: float | None = None
     held_out: int = 0
+    numbers: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         counts = {"demonstrations": self.demonstrations, "steps": self.steps, "held_out": self.held_out}
         check_whole_numbers(0, **counts, **self.observations)
         check_positive(**given(rate=self.rate))
         texts = *self.images.values(), *self.names.values(), *chain(*self.left_out.values())
+        texts = *texts, *chain(*self.numbers.values())
         if not all(isinstance(text, str) for text in (self.name, self.actions, *texts)):
             raise ValueError(f"names of a recording must be text, got {self}")
 

@@ -176,6 +176,8 @@ class Task:
                 demonstrations, index, environment, observations, images, actions=actions, play=play
             )
         index = demonstrations.index(observations, images) if recorded is None else recorded.index
+        if not index.image_keys and (demonstrations.image_size, demonstrations.resize) != (None, "squeeze"):
+            raise ValueError("image_size and resize belong to images: name them, or leave both out")
         is_robosuite = recorded is not None and index.env_args
         others = {
             "actions": actions != "delta" and not is_robosuite,

@@ -39,6 +39,12 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         image_size=options.image_size,
         resize=options.resize,
     )
+    if not demonstrations.environment(demonstrations.index(options.observations)):  # before images are read
+        raise ValueError(
+            f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
+            "train without an environment (python -m warmprior train), or describe a task of your own "
+            "(docs/benchmarks.md)"
+        )
     images: Sequence[str] = ()
     pictured = demonstrations
     if options.sees_images:
@@ -56,12 +62,7 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         actions=options.actions,
         play=play,
     )
-    if task.environment is None:
-        raise ValueError(
-            f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
-            "train without an environment (python -m warmprior train), or describe a task of your own "
-            "(docs/benchmarks.md)"
-        )
+    assert task.environment is not None
     if "gymnasium" in task.environment:
         return task
     task.facts["source"] = source

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -17,6 +18,7 @@ from warmprior import Prior
 from warmprior.checks import check_between, check_choice
 from warmprior.lerobot import history_indices
 from warmprior.modules.ode import DEFAULT_NFE
+from warmprior.modules.recording import Recording
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS
@@ -69,6 +71,8 @@ class WarmFlowConfig(PreTrainedConfig):
         resize: how images become square: `squeeze`, or `pad` with black.
         crop_size: side in pixels of the crop, which is random in training and central at decisions; by
             default 76 of 84, in proportion.
+        recording: what the policy was trained on, as JSON (:class:`~warmprior.modules.recording.Recording`);
+            training writes it, and the executor takes the names and the rate from it.
     """
 
     n_obs_steps: int = 2
@@ -89,6 +93,7 @@ class WarmFlowConfig(PreTrainedConfig):
     image_size: int = IMAGE_SIZE
     resize: str = "squeeze"
     crop_size: int | None = None
+    recording: str = ""
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "STATE": NormalizationMode.MIN_MAX,
@@ -104,6 +109,8 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # LeRobot fills in all features of a dataset later, but only where there are none yet.
+        self.names_observations = bool(self.input_features)
         if self.prior_chunk is None:  # saved as well, so that fewer actions can be executed later
             self.prior_chunk = self.n_action_steps
 
@@ -117,6 +124,10 @@ class WarmFlowConfig(PreTrainedConfig):
         """Make the source; a ``ValueError`` if the name or an option is unknown."""
         kind = registered(Prior, self.source.partition(",")[0], OWN_PRIORS)
         return build(kind, self.source, self.prior_chunk)
+
+    def make_recording(self) -> Recording | None:
+        """Return what the policy was trained on; ``None`` if it is unknown."""
+        return Recording(**json.loads(self.recording)) if self.recording else None
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""

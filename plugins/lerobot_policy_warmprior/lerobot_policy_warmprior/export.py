@@ -9,6 +9,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import cast
 
@@ -92,6 +93,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         nfe=actor.sampling.evaluations(),
         network=json.dumps(network.config()),
         precondition=isinstance(network, PreconditionedNetwork),
+        recording="" if actor.recording is None else json.dumps(asdict(actor.recording)),
         device="cpu",
         push_to_hub=False,
     )

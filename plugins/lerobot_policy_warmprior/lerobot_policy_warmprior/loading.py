@@ -168,7 +168,8 @@ class WholePolicy(nn.Module):
         except RuntimeError as error:
             if "state_dict" not in str(error):
                 raise
-            misfit = str(error)  # it names the weights
+            title, *names = map(str.strip, str(error).splitlines())  # it names each weight in a line
+            misfit = "; ".join([*names[:3], *(["..."] if len(names) > 3 else [])]) or title
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{place} has no policy: {error}") from error
         except (*UNBUILT, DraccusException) as error:

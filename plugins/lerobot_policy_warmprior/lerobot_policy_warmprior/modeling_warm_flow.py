@@ -7,6 +7,7 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any, Literal, cast
 
 import torch
@@ -74,8 +75,9 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     if the training continues from a saved policy.
 
     Raises:
-        ValueError: if the network does not fit the dataset, the dataset has no statistics, or the prior is
-            learned, which LeRobot would not train.
+        ValueError: if the network does not fit the dataset, the dataset has no statistics, the prior is
+            learned, which LeRobot would not train, or an observation that ``--policy.input_features`` does
+            not name holds the action of the same or a later step.
     """
 
     config_class = WarmFlowConfig
@@ -91,9 +93,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         config.validate_features()
+        steps = None
         if dataset_meta is not None:
             check_statistics(config, dataset_meta)
             check_used(config)
+            steps = self._training_steps(dataset_meta)
         prior = config.make_prior()
         if isinstance(prior, nn.Module):
             raise ValueError(
@@ -146,12 +150,13 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         if encoder is not None:
             network = VisionNetwork(encoder, network)
         if config.precondition and not preconditioned:
-            network = self._preconditioned(network, dataset_meta)
+            network = self._preconditioned(network, dataset_meta, steps)
         config.prior = config.source  # the preconditioning recognised absolute targets, if there are any
         prior = config.make_prior()
         if dataset_meta is not None:
             used = recording_of(config, dataset_meta, training_episodes(dataset_meta))
             logging.info("%s\n%-13s %s (--policy.prior)", used.text("--policy.{}"), "source", config.prior)
+            config.recording = json.dumps(asdict(used))
         # With MIN_MAX the data span [-1, 1], so actions are clipped to it before they are executed and
         # remembered. In other units the span is unknown.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
@@ -161,6 +166,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
             execute=config.n_action_steps,
             nfe=config.nfe,
             clip=1.0 if spans else None,
+            recording=config.make_recording(),
         )
         self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
@@ -171,7 +177,30 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         self.__dict__["_loss_of_actor"] = None
         self.reset()
 
-    def _preconditioned(self, network: VelocityNetwork, dataset_meta: Any) -> PreconditionedNetwork:
+    def _training_steps(self, dataset_meta: Any) -> TensorDictBase | None:
+        """Return the raw steps of the training, if this machine has them, and check observations by them."""
+        config, root = self.config, dataset_meta.root
+        if config.names_observations and not config.precondition:
+            return None  # nothing depends on them
+        if not any(root.glob("data/*/*.parquet")):
+            if not config.names_observations:
+                logging.warning(
+                    "%s has no steps: it is not checked if an observation holds the action of the same or a "
+                    "later step, its own target (--policy.input_features names observations)",
+                    root,
+                )
+            return None
+        demonstrations = open_demonstrations(f"lerobot:{root}", episodes=training_episodes(dataset_meta))
+        steps = demonstrations.steps(config.observed)
+        if not config.names_observations:
+            index = demonstrations.index(config.observed)
+            # Who names the joints wants to see them.
+            demonstrations.check_targets(index, steps, config.joints, option="--policy.input_features")
+        return steps
+
+    def _preconditioned(
+        self, network: VelocityNetwork, dataset_meta: Any, steps: TensorDictBase | None
+    ) -> PreconditionedNetwork:
         """Precondition the network by the moments of source and data; a saved policy's are in its file."""
         key, trend = self.config.joints, None
         if dataset_meta is None:
@@ -185,15 +214,11 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                 f"the preconditioning is fitted to actions that are normalised by MIN_MAX, not by {mode}: "
                 "choose that, or --policy.precondition=false"
             )
-        if not any(dataset_meta.root.glob("data/*/*.parquet")):
+        if steps is None:
             raise ValueError(
                 f"the preconditioning is fitted to the steps of a dataset, and {dataset_meta.root} has none: "
                 "set --dataset.streaming=false, or --policy.precondition=false"
             )
-        episodes = training_episodes(dataset_meta)
-        steps = open_demonstrations(f"lerobot:{dataset_meta.root}", episodes=episodes).steps(
-            self.config.observed
-        )
         # LeRobot's own step, because it maps a constant dimension to -1.
         names = (*self.config.observed, keys.ACTION)
         features = {**self.config.input_features, **self.config.output_features}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ def load_actor(place: str | Path, *, task: str = "", device: str = "cpu") -> War
 
     It includes the processors that LeRobot saved with it. Cameras have the last part of LeRobot's names:
     ``"front"`` for ``observation.images.front``. The ``"state"`` of a ``warm_flow`` policy is the
-    concatenation of its vectors, ``observation.environment_state`` before ``observation.state``.
+    concatenation of its vectors, ``observation.environment_state`` before ``observation.state``. For such a
+    policy the executor takes the dataset's own names as well, and its rate alone.
 
     Args:
         place: a folder, such as ``run/checkpoints/last/pretrained_model``, or a repository of the hub.
@@ -86,7 +88,11 @@ def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
         # As LeRobot scales, also where the range is so small that a normaliser only shifts.
         normalizer.loc(key).copy_((start + end) / 2)
         normalizer.scale(key).copy_((end - start) / 2)
-    return actor.replace(normalizer=normalizer)
+    recording = actor.recording
+    if recording is not None:
+        names = {name: feature for feature, name in entries.items() if feature in config.image_features}
+        recording = replace(recording, names=names)
+    return actor.replace(normalizer=normalizer, recording=recording)
 
 
 def _bounds(stats: dict[str, Any]) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
+from warmprior.keys import ACTION
+from warmprior.lerobot.names import number_names
 from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 
 OF_IMAGES = ("encoder", "image_size", "resize", "crop_size")
@@ -30,6 +32,7 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
     chosen = range(len(lengths)) if episodes is None else episodes
     seen = {*config.observed, *config.image_features}
     others = [name for name in described if name.startswith("observation") and name not in seen]
+    numbers = {name: number_names(described[name]) for name in (*config.observed, ACTION)}
     meaning = f", absolute targets of {config.joints}" if config.joints not in ("", "auto") else AS_RECORDED
     sized = config.image_size, config.resize
     return Recording(
@@ -41,4 +44,5 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
         {name: image_words(entry.shape[1:], *sized) for name, entry in config.image_features.items()},
         left_out={"input_features": others} if others else {},
         rate=dataset_meta.fps,
+        numbers={name: names for name, names in numbers.items() if names},
     )

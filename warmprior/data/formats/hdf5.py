@@ -293,7 +293,8 @@ def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str
     for key in keys:
         what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
         if images is None:
-            others = [name for name in names(demo["obs"]) if name.endswith("_image") and name != key]
+            options = _options(demo["obs"], names(demo["obs"]))
+            others = [name for name, option in options.items() if option == "images"]
             if not others:
                 raise DatasetError(
                     f"{_place(demo)} has no images: leave the images out, or render them from its states "

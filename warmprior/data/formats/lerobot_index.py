@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, override
 
 from warmprior.data.index import (
     DatasetError,
@@ -23,7 +23,7 @@ from warmprior.data.index import (
 from warmprior.envs.robosuite_tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
-from warmprior.lerobot.names import ROBOT_STATE, named_joints, short_names
+from warmprior.lerobot.names import ROBOT_STATE, named_joints, number_names, short_names
 
 if TYPE_CHECKING:
     from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -83,6 +83,14 @@ class LeRobotIndex(DatasetIndex):
     episodes: tuple[Mapping[str, Any], ...]
     columns: Mapping[str, tuple[str, slice]]
     described: Mapping[str, Any]
+
+    @property
+    @override
+    def numbers(self) -> dict[str, list[str]]:
+        features, whole = self.metadata.features, slice(None)
+        parts = {key: self.columns[key] for key in self.observation_keys} | {"action": ("action", whole)}
+        named = {key: number_names(features[name])[columns] for key, (name, columns) in parts.items()}
+        return {key: names for key, names in named.items() if names}
 
     @property
     def videos(self) -> list[str]:
