@@ -36,8 +36,8 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         mask=options.mask,
         style=style,
         task=next(iter(options.task), None) if source == "file" else None,
-        image_size=options.image_size,
-        resize=options.resize,
+        # A preset may have a size for the tasks that see images.
+        **({"image_size": options.image_size, "resize": options.resize} if options.sees_images else {}),
     )
     if not demonstrations.environment(demonstrations.index(options.observations)):  # before images are read
         raise ValueError(
