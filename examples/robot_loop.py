@@ -257,9 +257,11 @@ def play(options: argparse.Namespace) -> None:
     policy.register_forward_pre_hook(lambda module, inputs: time.sleep(options.decision))
     robot = SimulatedArm(options.camera, options.unplug)
     recorded = None if policy.recording is None else policy.recording.rate
-    rate, seen = recorded or options.rate, "camera" if options.camera else "no camera"
+    rate = recorded or options.rate
+    if rate != options.rate:
+        print(f"the policy's data have {rate:g} Hz, which replace --rate {options.rate:g}")
     record = run(robot, policy, rate, options.seconds)
-    print(f"NFE {policy.sampling.evaluations()}, {policy.prior.chunk_length} actions per chunk, {seen}")
+    print(f"NFE {policy.sampling.evaluations()}, {policy.prior.chunk_length} actions per chunk")
     print(record.report(1 / rate))
 
 

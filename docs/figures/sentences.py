@@ -115,7 +115,8 @@ def sentences() -> dict[str, list[str]]:
             f"clear difference**: {better_rates[0]}% and {better_rates[1]}%",
             f"{default_rates[0]}% and {default_rates[1]}% ({', '.join(c.chance for c in correlated_long)})",
             f"at NFE 9 ({rates[CORRELATED, 9]}% and {rates[GAUSSIAN, 9]}%) is within chance",
-            f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% at NFE 9 ({learned[9].chance})",
+            f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% at NFE 9 ({learned[9].chance} against the "
+            "Gaussian source)",
             f"a regression from the benchmarks (MIP) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
             f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at NFE 9 ({absolute.chance})",
             f"{paper[PAST]} points more with WP-Past at NFE 9, 3 and 1, {paper[PREVIEW]} with WP-Preview",
