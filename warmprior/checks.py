@@ -35,7 +35,7 @@ def check_finite_numbers(**values: Any) -> None:
 def check_whole_numbers(least: int = 1, /, **values: Any) -> None:
     """Raise ValueError for the first value that is not a whole number from ``least`` to below 2**63."""
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value < 2**63:
+        if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) < 2**63:
             raise ValueError(f"{name} must be a whole number of at least {least}, below 2**63, got {value!r}")
 
 

@@ -5,12 +5,17 @@ from itertools import groupby
 import prior_space_rl as benchmark
 import pytest
 import robomimic
+import torch
 
 from lab.options.command_line import parse
 from lab.running.agents import environment, frozen_policies
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
+from tests.envs.test_gymnasium import registered_dial
 from tests.errors import raises, refuses
-from warmprior import VelocityMLP, WarmPriorActor
+from tests.toy_env import mlp_actor
+from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+from warmprior.envs.description import registered_description
+from warmprior.io.workers import start_method
 from warmprior.rl import has_anchor
 
 TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
@@ -212,3 +217,16 @@ def test_the_toy_is_solved_in_the_benchmarks_budget(tmp_path):
     assert benchmark.main(argv) == 0
     (points,) = agents(stored(tmp_path / "out")).values()
     assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9
+
+
+@pytest.mark.skipif(start_method() == "spawn", reason="workers do not know what a test registers")
+def test_agents_of_a_gymnasium_environment_are_rewarded_by_success(monkeypatch):
+    dial = registered_dial(monkeypatch)  # its own reward is 1 a step
+    described = registered_description({**dial, "kwargs": {}, "observation_keys": []})
+    actor = mlp_actor(GaussianPrior(2), 1, 2, 1, environment=described)
+    env = environment(actor, False, 2, {}, seed=1)
+    after = torch.cat([env.rollout(2, break_when_any_done=False)["next"] for _ in range(3)], 1)
+    env.close()
+    # A solved episode ends, so a chunk earns 1 at most.
+    assert after["reward"].tolist() == after["success"].float().tolist()
+    assert 0 < after["success"].sum() < after["success"].numel()

@@ -5,12 +5,21 @@ import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.errors import missing, raises, refuses
-from warmprior.io.files import check_writable, exclusive, read_json, read_tensors, save_file, write_atomic
+from warmprior.io.files import (
+    check_writable,
+    exclusive,
+    read_json,
+    read_tensors,
+    save_file,
+    storing,
+    write_atomic,
+)
 
 FORK = multiprocessing.get_context("fork")
 
@@ -110,3 +119,25 @@ def test_only_a_lack_of_space_is_called_so(tmp_path, monkeypatch, code):
     with raises(OSError, "one.hdf5", reason) as caught:
         write_atomic(path, reading)
     assert caught.value.errno == code and missing(str(caught.value), path)
+
+
+@pytest.mark.parametrize(
+    ("error", "facts"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), ["cannot keep it", "space", "elsewhere"]),
+        (OSError(errno.EFBIG, "File too large"), ["cannot keep it", "elsewhere"]),
+        (OSError(errno.EACCES, "Permission denied", "kept/file"), ["cannot keep it", "elsewhere"]),
+        (OSError(errno.EACCES, "Permission denied", "read/file"), None),
+        (ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"), None),
+        (FileNotFoundError("a sentence of the library"), None),
+        (OSError(errno.EBADF, "Bad file descriptor", 999), ["cannot keep it", "elsewhere"]),
+    ],
+)
+def test_only_what_fails_in_a_folder_is_said_of_it(error, facts):
+    with pytest.raises(OSError) as caught, storing("cannot keep it", Path("kept"), "elsewhere"):
+        raise error
+    if facts is None:
+        assert caught.value is error
+    else:
+        assert not missing(str(caught.value), *facts) and caught.value.__cause__ is error
+        assert ("free some space" in str(caught.value)) == (error.errno == errno.ENOSPC)

@@ -153,6 +153,12 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(tmp
     assert list(Task(demonstrations, observations=named).recording.observations) == named
 
 
+def test_a_short_demonstration_hides_no_target(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.LENGTHS", (*LENGTHS, 1))
+    path = robot_file(tmp_path / "arm.hdf5", targets=moved(2))
+    refuses(lambda: Task(open_demonstrations(path)), DatasetError, "'targets'", "t + 2")
+
+
 def test_who_names_the_joints_wants_to_see_them(tmp_path):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5", joints=moved(0)))
     refuses(lambda: Task(demonstrations), DatasetError, "'joints'")

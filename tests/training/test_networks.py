@@ -37,6 +37,13 @@ class Short(VelocityNetwork):
         self.action_dim = action_dim
 
 
+class Swapped(Affine):
+    name = "swapped-network-of-the-tests"
+
+    def __init__(self, observation_dim, action_dim, prediction_length, observation_steps):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+
+
 def test_a_network_of_ones_own_is_built_with_the_sizes_and_its_options():
     options = NetworkOptions(f"{__name__}:Affine,width=5", observation_steps=1)
     sizes = {"action_dim": 2, "prediction_length": 4, "observation_steps": 1}
@@ -56,6 +63,7 @@ def test_a_network_of_ones_own_is_built_with_the_sizes_and_its_options():
         ("test_networks_that_cannot_be", ["velocity network"]),
         ("Affine,height=3", ["Affine", "height=3", "width"]),
         ("Short", ["Short", "action_dim"]),
+        ("Swapped", ["Swapped", "order"]),
         ("Forgetful", ["Forgetful", "'width'"]),  # it could not be saved
     ],
 )

@@ -23,7 +23,7 @@ from warmprior.modules.trend import vector_of
 from warmprior.options.data import IMAGE_SIZE, Resize
 
 ROWS = 2_000  # number of steps that decide if an observation is an action
-LATER = 16  # up to so many steps later, as long as most chunks
+LATER = 16  # number of steps, from the same one on, whose actions are compared
 
 
 class Demonstrations:
@@ -192,9 +192,10 @@ class Demonstrations:
         keys, first = np.repeat(index.observation_keys, index.observation_dims).tolist(), steps[:ROWS]
         seen, action, episode = vector_of(first[OBSERVATION]), first[ACTION], first[EPISODE]
         found: dict[str, int] = {}
-        # So that half of the steps are compared at least.
-        for later in range(min(LATER, 1 + min(index.lengths) // 2)):
+        for later in range(LATER):
             rows = episode[later:] == episode[: len(episode) - later]
+            if 2 * int(rows.sum()) < len(episode):  # too few are left to compare
+                break
             now, then = seen[: len(rows)][rows], action[later:][rows]
             for target in then.mT[(then != then[:1]).any(0)]:
                 equal = (now == target.unsqueeze(-1)).all(0).tolist()

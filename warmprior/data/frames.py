@@ -119,9 +119,9 @@ class ImageMap(MemoryMappedTensor):
         cls, filename: Path, dtype: torch.dtype, shape: Sequence[int], index: Any = None
     ) -> Any:
         """Map a file; ``index`` is the sizes, strides and offset of a part."""
-        images = super().from_filename(filename, dtype, shape)
-        if not _is_complete(Path(filename), shape):
+        if not _is_complete(Path(filename), shape):  # an empty file would be made
             raise FileNotFoundError(f"{filename} was removed meanwhile: read the demonstrations again")
+        images = super().from_filename(filename, dtype, shape)
         return images if index is None else images._index_wrap(images.as_strided(*index), None)
 
     def _index_wrap(self, tensor: Tensor, item: Any, check: bool = False) -> Any:

@@ -86,15 +86,19 @@ def robosuite_parts(
     return partial(RobosuiteEnv, **options), transforms
 
 
-def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
+def environment_parts(
+    actor: WarmPriorActor, *, by_success: bool = False
+) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
     """Return a builder of the environment that a policy was made for, and one of the policy's transforms.
 
-    Raises ValueError if the policy keeps no description of an environment.
+    ``by_success`` is True for agents: steps are rewarded by success alone, as robosuite's are anyway. Raises
+    ValueError if the policy keeps no description of an environment.
     """
     description: Any = actor.environment
     adapters: dict[str, Transform] = {}
     if is_registered(description):
-        make_env: Callable[..., EnvBase] = partial(registered_env, description["gymnasium"])
+        registered = description["gymnasium"]
+        make_env: Callable[..., EnvBase] = partial(registered_env, registered, sparse_reward=by_success)
     elif _is_complete(description):
         make_env, adapters = robosuite_parts(description)
     else:

@@ -24,7 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from warmprior.checks import check_distinct, given, is_true
+from warmprior.checks import check_distinct, check_whole_numbers, given, is_true
 from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
@@ -204,6 +204,8 @@ def registered_env(
         >>> env.rollout(9)["next", "truncated"].flatten().tolist()
         [False, False, True]
     """
+    check_whole_numbers(0, seed_offset=seed_offset)
+    check_whole_numbers(**given(seed_stride=seed_stride))
     gymnasium = importlib.import_module("gymnasium")
     name, wrappers = description["id"], description.get("wrappers")
     for package in REGISTERING if name not in gymnasium.registry else ():

@@ -134,14 +134,16 @@ def storing(what: str, folder: Path, elsewhere: str = "another folder") -> Itera
     try:
         yield
     except OSError as error:
-        reason: Any = error.__cause__ if isinstance(error, StorageError) else error
-        inside = True
-        if reason.filename is not None:  # none is named where a write or a reservation fails
+        cause = error.__cause__
+        reason: Any = cause if isinstance(error, StorageError) and isinstance(cause, OSError) else error
+        # A write or a reservation that fails names no file, and neither does a connection.
+        full, inside = reason.errno in (errno.ENOSPC, errno.EDQUOT), not isinstance(reason, ConnectionError)
+        if isinstance(reason.filename, str | Path):
             named, here = (Path(os.path.abspath(path)) for path in (reason.filename, folder))
             inside = named.is_relative_to(here) or here.is_relative_to(named)
         if reason.errno is None or not inside:
             raise
-        advice = "free some space, or choose" if reason.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
+        advice = "free some space, or choose" if full else "choose"
         raise StorageError(f"{what} ({reason}): {advice} {elsewhere}") from reason
 
 
@@ -149,7 +151,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
     A reader, or a process killed at any moment, sees the old file or the new one, never a part. The folder is
-    created if needed. An ``OSError`` names ``path`` if it cannot be written; others of ``write`` pass.
+    created if needed. The system's error names ``path`` if it cannot be written; others of ``write`` pass.
 
     Examples:
         >>> from pathlib import Path

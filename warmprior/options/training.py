@@ -90,7 +90,7 @@ class NetworkOptions:
     @property
     def is_own(self) -> bool:
         """Return True if the network is a user's class, in place of a name."""
-        return ":" in self.network
+        return ":" in self.network.partition(",")[0]
 
     @property
     def of_transformers(self) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,9 +134,8 @@ def improve_policy(
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     check_improvable(policy)
     if make_env is None:
-        make_env, make_transforms = environment_parts(policy)
+        make_env, make_transforms = environment_parts(policy, by_success=True)
         if is_registered(policy.environment):
-            make_env = partial(make_env, sparse_reward=True)  # its own may be another than success
             make_env().close()  # an error is better raised here than in a worker
     elif make_transforms is None:
         raise ValueError("make_env needs make_transforms, such as partial(policy_transforms, policy)")

@@ -39,11 +39,17 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         # A preset may have a size for the tasks that see images.
         **({"image_size": options.image_size, "resize": options.resize} if options.sees_images else {}),
     )
-    if not demonstrations.environment(demonstrations.index(options.observations)):  # before images are read
+    recorded = demonstrations.environment(demonstrations.index(options.observations))
+    if not recorded:  # before images are read
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
             "train without an environment (python -m warmprior train), or describe a task of your own "
             "(docs/benchmarks.md)"
+        )
+    if "gymnasium" in recorded and options.sees_images:
+        raise ValueError(
+            f"{path} was recorded in a Gymnasium environment, which shows policies no images: leave --images "
+            "out, or describe a task of your own (docs/benchmarks.md)"
         )
     images: Sequence[str] = ()
     pictured = demonstrations
@@ -62,8 +68,7 @@ def robosuite_task(path: Path | str, style: str, *, source: str, options: DataOp
         actions=options.actions,
         play=play,
     )
-    assert task.environment is not None
-    if "gymnasium" in task.environment:
+    if "gymnasium" in recorded:
         return task
     task.facts["source"] = source
     if pictured is not demonstrations:  # the facts are those of the original file

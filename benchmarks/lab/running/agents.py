@@ -45,7 +45,7 @@ def environment(
         transforms = policy_transforms(actor.prior, observation_steps=1, see_history=actor.sees_history)
         transforms.append(PriorAnchor(actor))
         return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
-    make_env, make_transforms = environment_parts(actor)
+    make_env, make_transforms = environment_parts(actor, by_success=True)
     workers = parallel_env(partial(make_env, **options), make_transforms, num_envs)
     # Outside of the workers, one anchor draws for all environments, and one encoder serves all.
     env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))

@@ -51,8 +51,8 @@ class WarmFlowConfig(PreTrainedConfig):
         n_action_steps: actions executed per decision, at most ``H``.
         prior_chunk: ``H``, actions that the prior remembers; by default ``n_action_steps``.
         prior: name of the prior with its options, such as ``past``, ``preview`` or ``past,sigma=0.3``; by
-            default ``past,correlation=0.5``, or ``gaussian`` if actions are absolute targets. Training writes
-            what it chose.
+            default ``past,correlation=0.5``, or ``gaussian`` if the preconditioning recognises absolute
+            targets. Training writes what it chose.
         cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk; 1 is one-step inference.
         precondition: precondition the network by the moments of source and data, see PreconditionedNetwork.
