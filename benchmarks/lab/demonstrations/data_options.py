@@ -32,9 +32,9 @@ def check_counts(options: Any, *names: str) -> None:
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         for count in value if isinstance(value, tuple) else (value,):
             if count is not None:
-                check_whole_numbers(**{option: count})
-                if count > MOST:
+                if isinstance(count, int) and count > MOST:
                     raise ValueError(f"{option} must be at most {MOST:,}, got {count}")
+                check_whole_numbers(**{option: count})
 
 
 @contextmanager
