@@ -198,8 +198,9 @@ def test_chosen_observations_are_read_from_held_out_demonstrations(tmp_path, mon
     path, other, keys = tmp_path / "lift.hdf5", tmp_path / "other.hdf5", ["robot0_eef_pos", "object"]
     write_robomimic_file(path, task="lift")
     write_robomimic_file(other, task="lift", seed=1)
-    monkeypatch.setattr(drift, "task", lambda: Task(open_demonstrations(path), observations=keys))
-    data, run = DataOptions(task=(f"{drift.__name__}:task",)), Run(out=tmp_path)
+    task = Task(open_demonstrations(path), observations=keys)
+    monkeypatch.setattr(drift, "chosen", lambda: task, raising=False)
+    data, run = DataOptions(task=(f"{drift.__name__}:chosen",)), Run(out=tmp_path)
     (policy,) = common.policies_of(Options(data, sources=Sources(prior=("past",)), run=run))
     measured, words = held_out(MeasuredOptions(data, validation=other, measured=20, run=run), policy)
     seen = policy.task().normalizer.denormalize(measured.data)["observation"]
