@@ -105,3 +105,15 @@ def flow_batch(length, size=3):
         "action": normal(size, length, 2),
         "action_is_pad": torch.zeros(size, length, dtype=torch.bool),
     }
+
+
+def dataset_policy(found, root, episodes=None, place=None, streamed=False, **options):
+    """As lerobot-train makes it, which names the dataset's metadata alone; and that dataset."""
+    from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
+    from lerobot.policies.factory import make_policy
+
+    config = found["warm_flow"].config_class(embedding_dim=24, num_layers=1, device="cpu", **options)
+    config.pretrained_path = place
+    kind = StreamingLeRobotDataset if streamed else LeRobotDataset
+    dataset = kind("local/tiny", root=root, episodes=episodes)
+    return make_policy(config, ds_meta=dataset.meta), dataset

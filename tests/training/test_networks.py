@@ -63,7 +63,7 @@ def test_a_network_of_ones_own_is_built_with_the_sizes_and_its_options():
         ("test_networks_that_cannot_be", ["velocity network"]),
         ("Affine,height=3", ["Affine", "height=3", "width"]),
         ("Short", ["Short", "action_dim"]),
-        ("Swapped", ["Swapped", "order"]),
+        ("Swapped", ["Swapped", "action_dim", "(2, 3, 4, 2)"]),
         ("Forgetful", ["Forgetful", "'width'"]),  # it could not be saved
     ],
 )

@@ -105,7 +105,8 @@ def environment_parts(
         kept = "" if description is None else f" (it keeps {description})"
         raise ValueError(
             f"the policy keeps no description of an environment of robosuite or Gymnasium{kept}: it was "
-            "trained on demonstrations alone. Build your environment with policy_transforms(actor)"
+            "trained on demonstrations alone. Build your environment with policy_transforms(actor); for a "
+            "robot see docs/your_robot.md"
         )
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(

@@ -63,6 +63,15 @@ class VelocityNetwork(nn.Module, Registered):
         self.action_dim, self.observation_dim = action_dim, observation_dim
         self.prediction_length, self.observation_steps = prediction_length, observation_steps
 
+    def check_sizes(self, *sizes: int) -> None:
+        """Raise ValueError if it was not built with the sizes ``d_a``, ``d_o``, ``P`` and ``To``."""
+        names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
+        if (built := tuple(getattr(self, name) for name in names)) != sizes:
+            raise ValueError(
+                f"{type(self).__name__} was built with ({', '.join(names)}) = {built}, but data and prior "
+                f"need {sizes}"
+            )
+
     def check_chunk(self, a: Tensor) -> None:
         """Raise ValueError if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""
         expected = (self.prediction_length, self.action_dim)

@@ -1,4 +1,4 @@
-"""How the sources and targets of a batch are paired: OT-CFM, 2-rectified flow, or a function of your own."""
+"""Couplings pair the sources and targets of a batch: OT-CFM, 2-rectified flow, or a function of your own."""
 
 from __future__ import annotations
 

@@ -77,12 +77,7 @@ def make_network(
     sizes = (action_dim, observation_dim, prediction_length, options.observation_steps)
     if options.is_own:
         network = make(VelocityNetwork, options.network, *sizes)
-        names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
-        if (built := tuple(getattr(network, name) for name in names)) != sizes:
-            raise ValueError(
-                f"{options.network} was built with {', '.join(names)} {built}, and needs {sizes}: its "
-                "constructor takes them in this order"
-            )
+        network.check_sizes(*sizes)  # a constructor may take them in another order
     else:
         kind, width = _NETWORKS[options.network]
         arguments: Any = options.of_transformers | given(**{width: options.hidden_dim})

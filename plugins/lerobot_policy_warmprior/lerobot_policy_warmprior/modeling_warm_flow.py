@@ -131,13 +131,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
                     "--policy.network is the JSON of VelocityNetwork.config(), got "
                     f"{config.network!r} ({error})"
                 ) from error
-            names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
-            built = tuple(getattr(network, name) for name in names)
-            if built != sizes:
-                raise ValueError(
-                    f"the network was built for {dict(zip(names, built, strict=True))}, but features and "
-                    f"prior need {dict(zip(names, sizes, strict=True))}"
-                )
+            network.check_sizes(*sizes)
         else:
             network = ChiTransformer(
                 *sizes,
