@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from lab.methods.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
+from lab.methods.learned_sources import A2APrior, CVAEHistoryPrior, ForecastPrior, ForecastStart, LeapPrior
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, window_replay_buffer, window_transforms
 from warmprior.modules import Prior
@@ -46,8 +46,9 @@ def learned(kind, data, iterations=400, **options):
         )
     recipe = {"iterations": iterations, "generator": generator, "learning_rate": 1e-2}
     minimise(learner.learning_loss, learner, buffers[0], **recipe)
-    with torch.no_grad():
-        learner.calibrate(buffers[1].sample())
+    if kind is not CVAEHistoryPrior:  # it draws, and has no scale to calibrate
+        with torch.no_grad():
+            learner.calibrate(buffers[1].sample())
     return learner.requires_grad_(False)
 
 
@@ -138,6 +139,25 @@ def test_only_what_a_source_sees_changes_it(kind, data, batch):
     unknown = cold.clone()
     unknown["history", "actions"] += 7.0  # of which there are too few: it must not matter
     assert torch.equal(mean_of(learner, cold), mean_of(learner, unknown))
+
+
+def test_a_cvae_that_sees_the_history_reads_it_once_it_is_full(data, batch):
+    prior = learned(CVAEHistoryPrior, data, iterations=5)
+
+    def chunks(windows):
+        source = prior.distribution(windows["history"], windows["observation"])
+        return source.sample(torch.Generator().manual_seed(0))
+
+    before = chunks(batch)
+    for key in (("history", "actions"), "observation"):
+        other = batch.clone()
+        other[key] += 1.0
+        assert bool((chunks(other) != before).flatten(1).any(-1).all()), key
+    cold = batch.clone()
+    cold["history", "steps"].fill_(H - 1)
+    unknown = cold.clone()
+    unknown["history", "actions"] += 7.0
+    assert torch.equal(chunks(cold), chunks(unknown))
 
 
 def test_step_starts_on_the_path_to_the_forecast_and_a_robot_that_stays_meets_more_noise():

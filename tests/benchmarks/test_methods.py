@@ -116,9 +116,9 @@ def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
 def test_history_is_withheld_from_those_alone_that_remember():
     training = TrainingConfig(cold_probability=0.5)
     remember = {name for name in METHODS if Method(name, H).recipe(training).cold_probability}
-    assert remember == {"past", "preview", "forecast", "history", "step", "a2a", "mip-past"}
+    assert remember == {"past", "preview", "forecast", "history", "step", "cvae-history", "a2a", "mip-past"}
     vector = {name for name in METHODS if Method(name, H).needs_vector}
-    assert vector == {"forecast", "ot", "bridge", "step", "cvae", "leap"}
+    assert vector == {"forecast", "ot", "bridge", "step", "cvae", "cvae-history", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector
 
 

@@ -153,7 +153,7 @@ def test_a_worker_that_reads_other_demonstrations_says_so(work, tmp_path):
     assert work is not common.train or not policy.is_trained
 
 
-LEARNT = ("forecast", "step", "cvae", "a2a", "leap")
+LEARNT = ("forecast", "step", "cvae", "cvae-history", "a2a", "leap")
 
 
 def test_every_method_is_trained_with_what_it_needs_before_it(tmp_path, capsys):

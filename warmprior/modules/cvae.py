@@ -98,11 +98,18 @@ class CVAEPrior(Prior, nn.Module):
     def _build(self, widths: list[int]) -> None:
         """Make the networks, with fresh weights."""
         self.widths = widths
-        action_dim, observation_dim, observation_steps = widths
-        seen, chunk = observation_steps * observation_dim, self.chunk_length * action_dim
+        chunk, read = self.chunk_length * widths[0], self.input_dim(*widths)
         layers: dict[str, Any] = {"num_cells": [self.hidden_dim] * 2, "activation_class": nn.GELU}
-        self.encoder = MLP(seen + chunk, 2 * self.latent_dim, **layers)
-        self.decoder = MLP(seen + self.latent_dim, chunk, **layers)
+        self.encoder = MLP(read + chunk, 2 * self.latent_dim, **layers)
+        self.decoder = MLP(read + self.latent_dim, chunk, **layers)
+
+    def input_dim(self, action_dim: int, observation_dim: int, observation_steps: int) -> int:
+        """Return the width of :meth:`network_input`."""
+        return observation_steps * observation_dim
+
+    def network_input(self, history: TensorDictBase, observation: Tensor) -> Tensor:
+        """Return what encoder and decoder read: the observation ``[*B, To, d_o]`` as ``[*B, To d_o]``."""
+        return observation.flatten(-2).to(self.decoder[0].weight.dtype)
 
     mean = GaussianPrior.mean  # cold everywhere
 
@@ -113,11 +120,11 @@ class CVAEPrior(Prior, nn.Module):
         source = super().distribution(history, observation)
         _, width, steps = self.widths
         check_shape("the observation of CVAEPrior", observation, (*source.loc.shape[:-2], steps, width))
-        inputs = observation.flatten(-2).to(self.decoder[0].weight.dtype)
+        inputs = self.network_input(history, observation)
         return _Decoded(source.loc, source.scale, source.warm, prior=self, inputs=inputs)
 
     def decode(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """Return the chunks ``[*B, P, d_a]`` of observations ``[*B, To d_o]`` and latents ``[*B, d_z]``."""
+        """Return the chunks ``[*B, P, d_a]`` of :meth:`network_input` and latents ``[*B, d_z]``."""
         return self.decoder(torch.cat([inputs, z], -1)).unflatten(-1, (self.chunk_length, -1))
 
     def fit(
@@ -134,8 +141,8 @@ class CVAEPrior(Prior, nn.Module):
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """Return the loss above on windows."""
-        dtype = self.decoder[0].weight.dtype
-        inputs, target = windows[keys.OBSERVATION].flatten(-2).to(dtype), windows[keys.CHUNK].to(dtype)
+        inputs = self.network_input(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        target = windows[keys.CHUNK].to(inputs.dtype)
         inside = ~windows[keys.IS_PAD].unsqueeze(-1)
         encoded = self.encoder(torch.cat([inputs, (target * inside).flatten(-2)], -1))
         mean, log_variance = encoded.chunk(2, -1)

@@ -14,12 +14,20 @@ from torchrl.modules import MLP
 from warmprior import keys
 from warmprior.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.actor import StartPoint
+from warmprior.modules.cvae import CVAEPrior
 from warmprior.modules.learning import inside_mean, minimise, widths_of
 from warmprior.modules.prior import PastPrior
 from warmprior.modules.source import Source
 
 # Smallest calibrated standard deviation of a learned Gaussian source, in normalised action units.
 SCALE_FLOOR = 0.02
+
+
+def last_chunk(history: TensorDictBase, length: int) -> Tensor:
+    """Return the last actions, ``[*B, length d_a + 1]``: zeros until there are so many, with a 1 after."""
+    full = (history["steps"] >= length).unsqueeze(-1)
+    actions = history["actions"][..., -length:, :]
+    return torch.cat([torch.where(full, actions, 0.0).flatten(-2), full[..., 0].to(actions.dtype)], -1)
 
 
 class Learner(nn.Module):
@@ -81,10 +89,7 @@ class Learner(nn.Module):
         """Return the input of the network, ``[*B, input_dim]``."""
         parts = [observation.flatten(-2)] if self.sees_observation else []
         if self.sees_history:
-            full = history["steps"] >= self.chunk_length
-            actions = history["actions"][..., -self.chunk_length :, :]
-            parts.append(torch.where(full.unsqueeze(-1), actions, 0.0).flatten(-2))
-            parts.append(full.to(actions.dtype))
+            parts.append(last_chunk(history, self.chunk_length))
         return torch.cat(parts, -1)
 
     def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
@@ -189,6 +194,21 @@ class A2APrior(LearnedPrior):
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
         mean = self.predicted(history, observation)
         return self._everywhere(mean, torch.full_like(mean[..., :1], self.sigma))
+
+
+class CVAEHistoryPrior(CVAEPrior):
+    """The source of :class:`CVAEPrior` from the observation and the last ``H`` actions."""
+
+    name = "cvae-history"
+    sees_history: ClassVar[bool] = True
+
+    def input_dim(self, action_dim: int, observation_dim: int, observation_steps: int) -> int:
+        observed = super().input_dim(action_dim, observation_dim, observation_steps)
+        return observed + self.chunk_length * action_dim + 1
+
+    def network_input(self, history: TensorDictBase, observation: Tensor) -> Tensor:
+        observed = super().network_input(history, observation)
+        return torch.cat([observed, last_chunk(history, self.chunk_length).to(observed.dtype)], -1)
 
 
 class ForecastStart(StartPoint, Learner):

@@ -28,7 +28,7 @@ from typing import Any
 import torch
 
 from lab.methods.bridge import BridgeCoupling
-from lab.methods.learned_sources import A2APrior, ForecastPrior, ForecastStart, LeapPrior
+from lab.methods.learned_sources import A2APrior, CVAEHistoryPrior, ForecastPrior, ForecastStart, LeapPrior
 from lab.methods.mip import SECOND, MIPCoupling, TwoStepCoupling
 from warmprior import (
     CVAEPrior,
@@ -167,6 +167,7 @@ METHODS: dict[str, Composition] = {
     "reflow": Composition("2-rectified flow", "#17becf", coupling=reflow, teacher="gaussian"),
     "step": Composition("STEP", "#00695c", start=ForecastStart),
     "cvae": Composition("CVAE source", "#c51b7d", CVAEPrior),
+    "cvae-history": Composition("CVAE source, history", "#f1b6da", CVAEHistoryPrior),
     "a2a": Composition("A2A (action space)", "#7f3b08", A2APrior),
     "leap": Composition("LeaP", "#b8a9c9", LeapPrior),
 }
@@ -347,8 +348,9 @@ class Method:
     @property
     def needs_vector(self) -> bool:
         """Return True if it reads the observation as one tensor, and so does not work with images."""
-        parts = self.parts.prior, self.parts.start
-        reads = CVAEPrior in parts or any(getattr(part, "sees_observation", False) for part in parts)
+        prior, start = self.parts.prior, self.parts.start
+        reads = any(getattr(part, "sees_observation", False) for part in (prior, start))
+        reads = reads or issubclass(prior, CVAEPrior)
         return reads or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
 
     @cached_property
@@ -360,7 +362,7 @@ class Method:
     def remembers(self) -> bool:
         """Return True if its chunks depend on the history."""
         part = self.parts.start or self.parts.prior
-        return self.parts.sees_history or (self.has_anchor and getattr(part, "sees_history", True))
+        return self.parts.sees_history or getattr(part, "sees_history", self.has_anchor)
 
     @property
     def teacher(self) -> Method | None:

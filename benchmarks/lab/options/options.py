@@ -48,7 +48,7 @@ class Sources:
 
     # methods to compare, with options as in preview,correlation=0.5; gains are over the first one: gaussian,
     # past, preview, forecast, history, regression, mip, mip-past, warm-start, ot, bridge, reflow, step, cvae,
-    # a2a, leap, or package.module:Class of your own on the PYTHONPATH
+    # cvae-history, a2a, leap, or package.module:Class of your own on the PYTHONPATH
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
     chunk: tuple[int, ...] = (8,)  # chunk lengths H
     sigma: tuple[float, ...] = ()  # noise of warm sources, a policy per value (default: past 0.5, preview 1)
