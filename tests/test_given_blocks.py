@@ -1,7 +1,9 @@
 """The blocks of pages that need something of the reader run with small stand-ins for it."""
 
 from functools import partial
+from typing import ClassVar
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -17,8 +19,9 @@ from tests.lerobot.tiny import ACTION, CAMERA, STATE, make_smolvla
 from tests.test_blocks import BLOCKS, GIVEN
 from tests.toy_env import Halfway, demonstrations, mlp_actor
 from warmprior import GaussianPrior, Normalizer, PastPrior, ReflowCoupling
+from warmprior.deploy import AsyncExecutor
 from warmprior.saving import save_policy
-from warmprior.training import TrainingConfig
+from warmprior.training import NetworkOptions, TrainingConfig
 
 pytestmark = NEEDS_PLUGIN
 
@@ -56,6 +59,37 @@ def dataset(here):
     widths = {"observation.environment_state": 16, "observation.state": 2, "action": 2}
     write_lerobot(here / "data", (20, 12), {name: numbers(width) for name, width in widths.items()})
     return {"place": f"lerobot:{here / 'data'}"}
+
+
+class FakeArm:
+    """An arm with the names of LeRobot's SO-101 and one camera; it notes what it is sent."""
+
+    joints = ("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "gripper.pos")
+    action_features: ClassVar = dict.fromkeys(joints, float)
+    observation_features: ClassVar = action_features | {"front": (48, 64, 3)}
+
+    def get_observation(self):
+        return dict.fromkeys(self.joints, 0.1) | {"front": np.zeros((48, 64, 3), np.uint8)}
+
+    def send_action(self, action):
+        self.sent = action
+
+
+@pytest.fixture
+def lerobot_arm(here):
+    """An arm of LeRobot beside an executor of a policy of its own recording, with its names."""
+    arm = FakeArm()
+    features = {name: numbers(4, list(arm.joints)) for name in ("observation.state", "action")}
+    write_lerobot(here / "arm", (20, 12), features, images=[("front", "image")], fps=30)
+    policy = warmprior.training.train_policy(
+        f"lerobot:{here / 'arm'}",
+        GaussianPrior(8),
+        images=["observation.images.front"],
+        network=NetworkOptions(encoder="small"),
+    )
+    with AsyncExecutor(policy, delay=0, control_rate=30) as executor:
+        yield {"robot": arm, "executor": executor}
+    assert tuple(arm.sent) == arm.joints and all(abs(target) < 10 for target in arm.sent.values())
 
 
 @pytest.fixture
@@ -96,6 +130,7 @@ STAND_INS = {
     saved: "folder",
     robot: "joints, image",
     dataset: "place",
+    lerobot_arm: "robot, executor",
     places: "moves, joints, poses",
     adapted: "policy, preprocessor, postprocessor, batch, observation, fps",
     simulated: "policy, base",
