@@ -67,12 +67,13 @@ doctest_test_doctest_blocks = ""
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
-# The tutorials run when the pages are built, in the order of their numbers, each from the same state; an
-# error ends the build. ``make docs ARGS='-D plot_gallery=0'`` leaves them as text.
+# The tutorials run when the pages are built, two at a time, each from the same state; an error ends the
+# build. ``make docs ARGS='-D plot_gallery=0'`` leaves them as text.
 sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
     "gallery_dirs": "auto_tutorials",
     "within_subsection_order": "FileNameSortKey",
+    "parallel": 2,
     "reset_modules": ("matplotlib", "tutorial_state.reset"),
     "abort_on_example_error": True,
     "min_reported_time": 1_000_000,
