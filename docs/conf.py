@@ -2,6 +2,7 @@
 
 import re
 import sys as _sys
+import warnings as _warnings
 from functools import cache as _cache
 from importlib.metadata import metadata as _metadata
 from pathlib import Path as _Path
@@ -66,6 +67,9 @@ toc_object_entries_show_parents = "hide"
 doctest_test_doctest_blocks = ""
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+
+# joblib says this when it replaces a worker whose memory has grown.
+_warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
 
 # The tutorials run when the pages are built, two at a time, each from the same state; an error ends the
 # build. ``make docs ARGS='-D plot_gallery=0'`` leaves them as text.

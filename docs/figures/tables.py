@@ -113,6 +113,29 @@ def slope_table(name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def curve_table(name: str) -> str:
+    """Return success in Markdown, in percent, after trainings of several lengths: a line per NFE and length.
+
+    The mean of the episodes' best coverage, also in percent, follows in parentheses where it was measured.
+    """
+    rows = read_played(name)
+    names = shown_sources(rows)
+    text = [f"| NFE | iterations | {' | '.join(SOURCES[source][0] for source in names)} |"]
+    text.append("|---" * (2 + len(names)) + "|")
+    for (nfe, iterations), part in rows.groupby(["nfe", "iterations"], sort=True):
+        entries = []
+        for source in names:
+            of = part[part["source"] == source]
+            if of.empty:
+                entries.append("")
+                continue
+            covered = of["episode_coverage"].mean() if "episode_coverage" in of else np.nan
+            score = "" if np.isnan(covered) else f" ({100 * covered:.0f})"
+            entries.append(f"{100 * of['success_rate'].mean() + 1e-6:.0f}{score}")
+        text.append(f"| {nfe} | {iterations:,} | {' | '.join(entries)} |")
+    return "\n".join(text) + "\n"
+
+
 def curvature_table(name: str) -> str:
     """Return curvature relative to the Gaussian source in Markdown, at the mean of the data."""
     rows = read_json(DATA / f"{name}.jsonl", lines=True).query("mean == 'training'")
@@ -164,6 +187,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "sigma": partial(study_table, "sigma"),
     "chunk": partial(study_table, "chunk"),
     "slope": slope_table,
+    "curve": curve_table,
     "curvature": curvature_table,
     "forecasts": forecasts_table,
     "agents": agents_table,
