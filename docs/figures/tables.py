@@ -14,6 +14,7 @@ from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
 from lab.measures.statistics import chosen_elsewhere
 
 SLOPES = {"marginal": "over all data", "conditional": "given the observation", "none": "no preconditioning"}
+SHOWN = {"perfect": "perfect (Algorithm 1)", "others": "of policies that have not seen the episode"}
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
 """This matches a marked table of a page."""
@@ -95,21 +96,21 @@ def study_table(column: str, name: str) -> str:
     return "\n".join(text) + "\n"
 
 
-def slope_table(name: str) -> str:
-    """Return success in Markdown, in percent, with that of each training: a line per NFE and slope."""
+def setting_table(column: str, labels: Mapping[str, str], name: str) -> str:
+    """Return success in Markdown, in percent, with that of each training: a line per NFE and setting."""
     rows = read_played(name)
     names = shown_sources(rows)
-    text = [f"| NFE | slope | {' | '.join(SOURCES[source][0] for source in names)} |"]
+    text = [f"| NFE | {column} | {' | '.join(SOURCES[source][0] for source in names)} |"]
     text.append("|---" * (2 + len(names)) + "|")
     for nfe in sorted(rows["nfe"].unique(), reverse=True):
-        for slope in (name for name in SLOPES if (rows["slope"] == name).any()):
+        for setting in (name for name in labels if (rows[column] == name).any()):
             entries = []
             for source in names:
-                part = rows[(rows["nfe"] == nfe) & (rows["slope"] == slope) & (rows["source"] == source)]
+                part = rows[(rows["nfe"] == nfe) & (rows[column] == setting) & (rows["source"] == source)]
                 each = [f"{100 * rate:.0f}" for rate in part.sort_values("seed")["success_rate"]]
                 one = f" ({', '.join(each)})" if len(each) > 1 else ""
                 entries.append(f"{100 * part['success_rate'].mean() + 1e-6:.0f}{one}" if each else "")
-            text.append(f"| {nfe} | {SLOPES[slope]} | {' | '.join(entries)} |")
+            text.append(f"| {nfe} | {labels[setting]} | {' | '.join(entries)} |")
     return "\n".join(text) + "\n"
 
 
@@ -186,7 +187,8 @@ KINDS: dict[str, Callable[[str], str]] = {
     "rows": played_table,  # by NFE and noise
     "sigma": partial(study_table, "sigma"),
     "chunk": partial(study_table, "chunk"),
-    "slope": slope_table,
+    "slope": partial(setting_table, "slope", SLOPES),
+    "shown": partial(setting_table, "forecast", SHOWN),  # to WP-Preview in training
     "curve": curve_table,
     "curvature": curvature_table,
     "forecasts": forecasts_table,
