@@ -33,6 +33,10 @@ ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
     "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
+    "type": (
+        env_args(json.dumps({"env_name": "Lift", "type": {}, "env_kwargs": {}})),
+        ["env_args", "type={}"],
+    ),
     "no name": (env_args(json.dumps({"type": 1})), ["env_name"]),
     "number for kwargs": (env_args('{"env_name": "Lift", "env_kwargs": 3}'), ["env_args", "env_kwargs"]),
     "no data": (lambda f, folder: f.move("data", "elsewhere"), ["'data'", "elsewhere"]),

@@ -105,6 +105,9 @@ def _says_so(read: RobomimicDemonstrations, data: TensorDictBase, actions: str) 
         ]
         deltas = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
         meta = json.loads(file["data"].attrs["env_args"])
+        simulator = meta.get("type", 1)
+        if isinstance(simulator, int) and simulator != 1:
+            meta = {}  # no environment that can be built
         rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
     pairs = [(data["observation"], np.concatenate(values)), (data["next", "reward"][:, 0], rewards)]
     if actions == "delta":

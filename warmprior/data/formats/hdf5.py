@@ -396,7 +396,10 @@ class RobomimicDemonstrations(Demonstrations):
                 )
             # A file without a description comes from a robot, or from another simulator than robosuite, whose
             # type is 1 in robomimic.
-            if isinstance(described, dict) and described.get("type", 1) != 1:
+            if isinstance(described, dict) and (simulator := described.get("type", 1)) != 1:
+                if not isinstance(simulator, int):
+                    what = f"{path}: data.attrs['env_args'] has type={simulator!r}"
+                    raise DatasetError(f"{what}, not the number of a simulator: write 1 for robosuite")
                 described = None
             env_args = (
                 {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)
