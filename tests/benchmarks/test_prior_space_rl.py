@@ -15,7 +15,6 @@ from tests.errors import raises, refuses
 from tests.toy_env import mlp_actor
 from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
 from warmprior.envs.description import registered_description
-from warmprior.io.workers import start_method
 from warmprior.rl import has_anchor
 
 TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
@@ -219,7 +218,6 @@ def test_the_toy_is_solved_in_the_benchmarks_budget(tmp_path):
     assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9
 
 
-@pytest.mark.skipif(start_method() == "spawn", reason="workers do not know what a test registers")
 def test_agents_of_a_gymnasium_environment_are_rewarded_by_success(monkeypatch):
     dial = registered_dial(monkeypatch)  # its own reward is 1 a step
     described = registered_description({**dial, "kwargs": {}, "observation_keys": []})

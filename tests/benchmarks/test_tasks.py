@@ -16,6 +16,7 @@ from lab.running.policies import policies_of
 from tests.benchmarks.script_parts import described, flow, options, refused, stored
 from tests.data.synthetic import env_args_14, shortened, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
+from tests.errors import raises
 from tests.processes import apart, here
 from warmprior import ImageEncoder
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
@@ -34,6 +35,12 @@ def test_observations_of_a_file_are_chosen(dataset):
     assert task.data["observation"].shape[-1] == 3 + TASKS["lift"].object_dim
     assert task.make_env().reset()["observation"].shape == task.data["observation"].shape[1:]
     assert task.identity != usual.identity
+
+
+def test_joints_are_the_observation_that_is_named(dataset):
+    """Which deltas are not near: the hand's position follows the object's numbers."""
+    with raises(ValueError, "lift", f"number {TASKS['lift'].object_dim + 1} of the observation"):
+        load_task(DataOptions(dataset=dataset, joints="robot0_eef_pos"), None)
 
 
 def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path, capfd):

@@ -119,3 +119,14 @@ FAULTS = {
     "another dimension": _resized(lambda shape: (*shape, 2)),
     **{str(value): _holding(value) for value in (np.nan, np.inf, -np.inf, 1e38, -1e38)},
 }
+
+
+def damage_heap(path, part, size):
+    """Change the size of the first string, or of the free part behind an only one, in a file's last heap."""
+    content = bytearray(path.read_bytes())
+    string = content.rindex(b"GCOL") + 16
+    length = int.from_bytes(content[string + 8 : string + 16], "little")
+    header = {"string": string, "free": string + 16 + -(-length // 8) * 8}[part]
+    assert content[header : header + 8] == {"string": b"\1" + bytes(7), "free": bytes(8)}[part]
+    content[header + 8 : header + 16] = size.to_bytes(8, "little")
+    path.write_bytes(content)

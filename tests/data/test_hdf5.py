@@ -160,7 +160,8 @@ def test_what_is_no_file_or_not_whole(square_file, tmp_path):
             RobomimicDemonstrations(place).index()
     whole = path.read_bytes()
     parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
-    for content in (*parts, b"<html>please log in"):
+    far = whole[:50] + bytes(6) + whole[56:]  # the undefined address of the driver becomes 65,535
+    for content in (*parts, far, b"<html>please log in"):
         path.write_bytes(content)
         unreadable(path, "HDF5")
 

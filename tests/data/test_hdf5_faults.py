@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.data.hdf5_faults import FAULTS, replace, unreadable
+from tests.data.hdf5_faults import FAULTS, damage_heap, replace, unreadable
 from tests.errors import refuses
+from tests.fuzz import sandbox
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 
 
@@ -32,6 +33,10 @@ ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
     "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
+    "type": (
+        env_args(json.dumps({"env_name": "Lift", "type": {}, "env_kwargs": {}})),
+        ["env_args", "type={}"],
+    ),
     "no name": (env_args(json.dumps({"type": 1})), ["env_name"]),
     "number for kwargs": (env_args('{"env_name": "Lift", "env_kwargs": 3}'), ["env_args", "env_kwargs"]),
     "no data": (lambda f, folder: f.move("data", "elsewhere"), ["'data'", "elsewhere"]),
@@ -118,6 +123,20 @@ def test_masks_of_another_kind(square_file, name):
         else:
             file["mask/train"] = mask
     unreadable(path, "mask/train", fact, mask="train")
+
+
+@pytest.mark.parametrize("mask", [None, "texts"])
+@pytest.mark.parametrize(("part", "size"), [("free", 0), ("free", 8), ("string", 2**64 - 16)])
+def test_a_heap_of_strings_over_which_hdf5_walks_for_ever(square_file, monkeypatch, part, size, mask):
+    path, _ = square_file
+    if mask is not None:
+        with h5py.File(path, "a") as file:
+            file.create_dataset(f"mask/{mask}", data=["demo_0"], dtype=h5py.string_dtype())
+    damage_heap(path, part, size)
+    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 10.0)
+    found = sandbox.attempt(RobomimicDemonstrations(path, mask=mask).steps, str(path))
+    assert found.kind == "refused", found
+    assert "heap" in found.detail
 
 
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):

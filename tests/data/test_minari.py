@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.data.hdf5_faults import FAULTS, replace
+from tests.data.hdf5_faults import FAULTS, damage_heap, replace
 from tests.errors import raises, refuses
+from tests.fuzz import sandbox
 
 minari = pytest.importorskip("minari")
 
@@ -147,6 +148,25 @@ def test_no_dataset_is_read_that_holds(root, tmp_path, fault, name):
     others = {"link to a link": "elsewhere", "group": "episode 1", "empty": "episode 1"}
     with raises(DatasetError, "walk/human-v0", others.get(fault, name.split("/")[-1])):
         MinariDemonstrations(dataset).steps()
+
+
+@pytest.mark.parametrize("place", ["options", "infos"])
+def test_a_heap_of_strings_over_which_hdf5_walks_for_ever(root, monkeypatch, place):
+    """Of what Minari reads: the options of a reset, and what a step reported."""
+    dataset = written()
+    (path,) = root.rglob("main_data.hdf5")
+    with h5py.File(path, "a") as file:
+        if place == "options":
+            file["episode_1"].attrs["options/scene"] = "kitchen"
+        else:
+            texts = {"data": ["door"] * LENGTHS[1], "dtype": h5py.string_dtype()}
+            file.create_dataset("episode_1/infos/scene", **texts)
+    MinariDemonstrations(dataset).steps()
+    damage_heap(path, "string", 2**64 - 16)
+    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 10.0)
+    found = sandbox.attempt(MinariDemonstrations(dataset).steps, str(path))
+    assert found.kind == "refused", found
+    assert "heap" in found.detail
 
 
 @pytest.mark.parametrize("form", ["hdf5", "parquet"])

@@ -17,6 +17,7 @@ from torchrl._utils import _check_for_faulty_process
 from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
+from tests.envs.test_gymnasium import registered_dial
 from tests.errors import raises, refuses
 from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
@@ -32,6 +33,7 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.data import demonstrations_of
+from warmprior.envs.description import environment_of, environment_parts, registered_description
 from warmprior.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.evaluation.parallel import watched
 from warmprior.io.workers import WorkerError
@@ -243,6 +245,33 @@ def test_a_worker_that_torchrl_finds_dead_first_is_named(closed):
         workers[0].terminate()
         workers[0].join()
         raise ConnectionError
+
+
+def test_a_spawned_worker_knows_what_this_process_registered(monkeypatch):
+    monkeypatch.setattr("warmprior.io.workers._forks", False)
+    dial = registered_dial(monkeypatch)
+    described = registered_description({**dial, "kwargs": {}, "observation_keys": []})
+    actor = mlp_actor(GaussianPrior(2), 1, 2, 1, environment=described)
+    workers = parallel_env(*environment_parts(actor), num_envs=1)
+    envs = workers, SerialEnv(1, [partial(environment_of, actor)])
+    found, expected = (evaluate(actor, env, episodes=5, first_seed=0) for env in envs)
+    workers.close()
+    outcomes = [(episode.steps, episode.success) for episode in expected]
+    assert [(episode.steps, episode.success) for episode in found] == outcomes
+    assert {success for _, success in outcomes} == {False, True}
+
+
+def here_alone(pid, **options):
+    if os.getpid() != pid:
+        raise LookupError("another process")
+    return SeededEnv(**options)
+
+
+def test_a_worker_that_cannot_build_its_environment_is_no_bare_end_of_file():
+    env = parallel_env(partial(here_alone, os.getpid()), partial(policy_transforms, PastPrior(H)), 1)
+    env.configure_parallel(shutdown_timeout=0.5)  # TorchRL waits for it
+    with raises(WorkerError, "environment", "spawned"):
+        env.reset()
 
 
 def hold_environments(pipe):

@@ -15,7 +15,6 @@ from tests.toy_env import mlp_actor
 from warmprior import GaussianPrior, PastPrior, RealTimeChunking, policy_transforms
 from warmprior.envs.description import environment_of, registered_description
 from warmprior.evaluation import evaluate, parallel_env
-from warmprior.io.workers import start_method
 from warmprior.rl import improve, improve_policy, improved_policy
 from warmprior.saving import load_policy, save_policy
 from warmprior.saving.checkpoint import load_state
@@ -127,7 +126,6 @@ def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monk
     assert len({*seeds[:2]}) == 1 and seeds[2] == 10_000_000 and seeds[0] > 10_000_000 + 4
 
 
-@pytest.mark.skipif(start_method() == "spawn", reason="workers do not know what a test registers")
 def test_a_policy_of_gymnasium_is_improved_by_its_success(tmp_path, monkeypatch):
     """Played beside the library's numbers of episodes: environments that are seeded one by one."""
     dial = registered_dial(monkeypatch)

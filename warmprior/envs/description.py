@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior.checks import given
 from warmprior.envs.env_args import delta_conventions
-from warmprior.envs.gymnasium import registered_env
+from warmprior.envs.gymnasium import registered_builder
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import uncompiled
@@ -98,7 +98,7 @@ def environment_parts(
     adapters: dict[str, Transform] = {}
     if is_registered(description):
         registered = description["gymnasium"]
-        make_env: Callable[..., EnvBase] = partial(registered_env, registered, sparse_reward=by_success)
+        make_env: Callable[..., EnvBase] = registered_builder(registered, sparse_reward=by_success)
     elif _is_complete(description):
         make_env, adapters = robosuite_parts(description)
     else:

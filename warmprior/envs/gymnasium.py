@@ -6,7 +6,8 @@ import copy
 import importlib
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -165,6 +166,15 @@ REGISTERING = ("gymnasium_robotics", "gym_pusht")
 """The packages that register environments when imported; they are imported if installed."""
 
 
+def _is_known(name: str) -> bool:
+    """Return True if an environment is registered, after an import of what might register it."""
+    registry = importlib.import_module("gymnasium").registry
+    for package in REGISTERING if name not in registry else ():
+        if find_spec(package) is not None:
+            importlib.import_module(package)
+    return name in registry
+
+
 def registered_env(
     description: Mapping[str, Any],
     *,
@@ -208,10 +218,7 @@ def registered_env(
     check_whole_numbers(**given(seed_stride=seed_stride))
     gymnasium = importlib.import_module("gymnasium")
     name, wrappers = description["id"], description.get("wrappers")
-    for package in REGISTERING if name not in gymnasium.registry else ():
-        if find_spec(package) is not None:
-            importlib.import_module(package)
-    if name not in gymnasium.registry:
+    if not _is_known(name):
         raise ImportError(
             f"Gymnasium has no environment {name!r}: install the package that registers it, and import that "
             "before (gymnasium-robotics: pip install --no-deps gymnasium-robotics pettingzoo imageio)"
@@ -250,3 +257,19 @@ def registered_env(
     if success not in (None, SUCCESS):
         made.append_transform(RenameTransform([success], [SUCCESS]))
     return made
+
+
+def registered_builder(description: Mapping[str, Any], **options: Any) -> Callable[..., TransformedEnv]:
+    """Return a builder, see :func:`registered_env`, that other processes can use as well.
+
+    A spawned process lacks what a script or a module of the user's has registered in this one: Gymnasium's
+    entry goes with the builder.
+    """
+    entry = importlib.import_module("gymnasium").registry.get(description["id"])
+    return partial(_build, entry, description, **options)
+
+
+def _build(entry: Any, *args: Any, **options: Any) -> TransformedEnv:
+    if entry is not None and not _is_known(entry.id):
+        importlib.import_module("gymnasium").registry[entry.id] = entry
+    return registered_env(*args, **options)

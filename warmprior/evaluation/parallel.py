@@ -7,14 +7,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any
+from typing import Any, override
 
 from torch import nn
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from warmprior.checks import check_whole_numbers
-from warmprior.io.workers import dead_worker_error, end_with_parent, start_method
+from warmprior.io.workers import WorkerError, dead_worker_error, end_with_parent, start_method
 
 
 def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
@@ -27,6 +27,17 @@ class _StridedEnv(ParallelEnv):
 
     strided_seeds = True
     make_transforms: Callable[[], Compose]
+
+    @override
+    def _start_workers(self) -> None:
+        try:
+            super()._start_workers()
+        except (ConnectionError, EOFError) as error:
+            raise WorkerError(
+                "a worker ended before it had built its environment, which this process can build; its own "
+                "error is above. Workers that are spawned, as where there is a GPU, know what modules do as "
+                "they are imported, and nothing else of this process: do there what the environment needs"
+            ) from error
 
 
 def parallel_env(

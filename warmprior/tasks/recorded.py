@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 from tensordict.utils import NestedKey
@@ -18,7 +17,7 @@ from warmprior.data.images import check_images, renderer_versions
 from warmprior.data.index import DatasetIndex
 from warmprior.envs.description import environment_description, registered_description, robosuite_parts
 from warmprior.envs.env_args import modernize_env_args
-from warmprior.envs.gymnasium import registered_env
+from warmprior.envs.gymnasium import registered_builder
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION
 from warmprior.options.data import Actions
@@ -137,7 +136,7 @@ def _gymnasium(
     return RecordedEnvironment(
         index,
         # Unknown wrappers raise an error only when it is built, which training does not need.
-        partial(registered_env, environment),
+        registered_builder(environment),
         registered_description(environment),
         demonstrations.title,
         demonstrations.style or "human",

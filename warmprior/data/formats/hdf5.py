@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from warmprior.data import index as indices
 from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.heaps import open_checked
 from warmprior.data.index import (
     BLOCK,
     DatasetError,
@@ -83,8 +84,11 @@ def check_members(parent: h5py.Group, name: str) -> None:
     """Raise DatasetError unless what is below ``parent`` is fully stored in this file, with all it holds."""
     with reading(parent, name):  # a group that holds itself ends in a RecursionError
         item = member(parent, name)
-        for inner in names(item) if isinstance(item, require("h5py", "sim").Group) else ():
-            check_members(item, inner)
+        if isinstance(item, require("h5py", "sim").Group):
+            for inner in names(item):
+                check_members(item, inner)
+        elif item is not None and item.dtype.hasobject:
+            item[()]  # which checks its heaps
 
 
 def _place(parent: h5py.Group, name: str = "") -> str:
@@ -164,19 +168,20 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
         raise IsADirectoryError(f"{path} is a folder: name a file of it")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; check the path")
-    try:
-        file = h5py.File(path, "r")
-    except BlockingIOError as error:
-        raise DatasetError(
-            f"{path}: another process has it open to write ({error}): close it there, or wait; on a file "
-            "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
-        ) from error
-    except OSError as error:
-        if error.errno is not None:  # the system's reason, not the format's
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-        size = path.stat().st_size
-        raise DatasetError(f"{path}: not a readable HDF5 file ({size} bytes; {error}). {_AGAIN}") from error
-    with file:
+    with ExitStack() as opened:
+        try:
+            opened.enter_context(h5py.File(path, "r"))  # for HDF5's lock, which the other lacks
+            file = opened.enter_context(open_checked(path))
+        except BlockingIOError as error:
+            raise DatasetError(
+                f"{path}: another process has it open to write ({error}): close it there, or wait; on a file "
+                "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
+            ) from error
+        except OSError as error:
+            if error.errno is not None:  # the system's reason, not the format's
+                raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+            what = f"{path}: not a readable HDF5 file ({path.stat().st_size} bytes; {error})"
+            raise DatasetError(f"{what}. {_AGAIN}") from error
         yield file
 
 
@@ -391,7 +396,10 @@ class RobomimicDemonstrations(Demonstrations):
                 )
             # A file without a description comes from a robot, or from another simulator than robosuite, whose
             # type is 1 in robomimic.
-            if isinstance(described, dict) and described.get("type", 1) != 1:
+            if isinstance(described, dict) and (simulator := described.get("type", 1)) != 1:
+                if not isinstance(simulator, int):
+                    what = f"{path}: data.attrs['env_args'] has type={simulator!r}"
+                    raise DatasetError(f"{what}, not the number of a simulator: write 1 for robosuite")
                 described = None
             env_args = (
                 {} if described is None else check_env_args(f"{path}: data.attrs['env_args']", described)

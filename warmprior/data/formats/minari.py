@@ -75,7 +75,9 @@ def _check_files(folder: Path) -> None:
         with open_hdf5(data) as file:
             episodes = names(file)
             for episode in episodes:
-                member(file, episode, "group")
+                if (group := member(file, episode, "group")) is not None:
+                    with reading(f"{data}: the metadata of {episode}", _AGAIN):
+                        dict(group.attrs)  # which checks their heaps
     count = read_json(folder / "metadata.json")["total_episodes"]
     if count != len(episodes):
         raise DatasetError(f"{folder}: metadata.json counts {count} episodes, not {len(episodes)}. {_AGAIN}")
