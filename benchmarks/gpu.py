@@ -25,7 +25,7 @@ from xml.etree import ElementTree
 from tqdm import tqdm
 
 from lab.demonstrations.data_options import check_counts
-from lab.io.files import ERRORS, PartialFailure, read_lines
+from lab.io.errors import ERRORS, PartialFailure
 from lab.io.machine import check_device, facts_of_machine
 from lab.options.command_line import read, script
 from lab.options.options import Options, check_given, with_parts
@@ -233,7 +233,7 @@ def commit_of_sources() -> str:
 @script("gpu.py", hint="the same command continues")
 def main(argv: list[str] | None) -> None:
     o = read(GpuOptions(), sys.argv[1:] if argv is None else argv, __doc__)
-    from lab.reporting.rows import RESULTS
+    from lab.reporting.rows import RESULTS, read_lines
 
     o.check()
     parts = sorted(set(o.part or PARTS))

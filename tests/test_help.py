@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from lab.methods.methods import METHODS
+from warmprior.modules.prior import Prior
+
 ROOT = Path(__file__).parents[1]
 SCRIPTS = [path.stem for path in (ROOT / "benchmarks").glob("*.py")]
 OF_DEMONSTRATIONS = ["generate", "download", "render"]
@@ -71,6 +74,14 @@ def test_what_happens_without_an_option_is_said_once(helps):
         (name, option): each for name, text in helps.items() for option, each in options_of(text).items()
     }
     assert not [place for place, entry in entries.items() if len(re.findall(r"\bdefault\b", entry)) > 1]
+
+
+def test_help_names_every_source_and_method(helps):
+    """Help is written by hand, since the tables of both need PyTorch."""
+    sources = {name for name, kind in Prior.classes.items() if kind.__module__.startswith("warmprior.")}
+    for name, known in (("warmprior.__main__ train", sources), ("robomimic", set(METHODS))):
+        said = re.findall(r"[\w-]+", options_of(helps[name])["--prior"])
+        assert "past" in known and not known - set(said), name
 
 
 @pytest.mark.parametrize("name", ["warmprior.__main__", "demonstrations"])

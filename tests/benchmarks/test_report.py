@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from lab.io.files import PartialFailure
+from lab.io.errors import PartialFailure
 from lab.options.command_line import parse, started
 from lab.options.presets import PRESETS
 from lab.reporting import report

@@ -1,1 +1,1 @@
-"""Files of results, worker processes of this machine or of Ray, and the machine itself."""
+"""Errors of runs, worker processes of this machine or of Ray, and the machine itself."""

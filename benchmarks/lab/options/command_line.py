@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from lab.demonstrations.data_options import resolved_place
-from lab.io.files import ERRORS
+from lab.io.errors import ERRORS
 from lab.io.machine import check_device, facts_of_machine
 from lab.io.workers import at_most
 from lab.options.options import Options, with_parts

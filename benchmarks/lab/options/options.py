@@ -1,7 +1,7 @@
 """The options that all benchmarks share: a dataclass per concern.
 
-Every option is declared once: here, in `DataOptions` (lab/demonstrations/tasks.py), or in the library's
-`NetworkOptions` and `TrainingConfig`. Comments of fields are the help texts of the command line.
+Every option is declared once: here, in `DataOptions` (lab/demonstrations/data_options.py), or in the
+library's `NetworkOptions` and `TrainingConfig`. Comments of fields are the help texts of the command line.
 """
 
 from __future__ import annotations

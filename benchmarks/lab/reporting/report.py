@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from pandas import DataFrame, Series
 
-from lab.io.files import PartialFailure
+from lab.io.errors import PartialFailure
 from lab.measures.statistics import ENOUGH_TRAININGS, interval, sign_flip_test, spread_of, weights_elsewhere
 from lab.methods.methods import label
 from lab.options.options import Options, with_parts

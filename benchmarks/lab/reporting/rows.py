@@ -14,9 +14,8 @@ from typing import Any
 
 import pandas as pd
 
-from lab.io.files import read_lines
 from lab.reporting.columns import IDENTITY, column
-from warmprior.io.files import write_atomic
+from warmprior.io.files import check_regular, write_atomic
 
 RESULTS = "results.jsonl"
 """The file of a run with a row per evaluation."""
@@ -65,6 +64,22 @@ def read_rows(
                 f"{path}, line {number}: {error}: remove that line, and continue with --resume"
             ) from error
     return rows
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read a file of JSON objects, one per line; a ``ValueError`` names a damaged line."""
+    check_regular(path)
+    records = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            records.append(json.loads(line))
+            if not isinstance(records[-1], dict):
+                raise ValueError("it is no JSON object")
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"{path}, line {number} is damaged ({error}): remove that line, and continue with --resume"
+            ) from error
+    return records
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

@@ -25,7 +25,7 @@ from typing import Any, Self
 
 from tqdm import tqdm
 
-from lab.io.files import ERRORS
+from lab.io.errors import ERRORS
 from lab.io.workers import available_cores, fresh_processes
 from lab.options.options import Run
 
