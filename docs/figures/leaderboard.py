@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from comparisons import Comparison, compare
 from pandas import DataFrame, concat
 from results import CHOICES, GROUPS, TWENTY_FIVE, all_lengths, paper_table
 from scipy.stats import rankdata
@@ -25,9 +26,7 @@ from shared import (
     PREVIEW,
     SOURCES,
     WIDTH,
-    Comparison,
     beside,
-    compare,
     figure,
     finish,
     read_played,

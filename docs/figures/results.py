@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from comparisons import Comparison, compare, estimate
 from pandas import DataFrame, concat
 from shared import (
     CORRELATED,
@@ -25,10 +26,7 @@ from shared import (
     PREVIEW,
     SOURCES,
     WIDTH,
-    Comparison,
     at_nine_three_one,
-    compare,
-    estimate,
     figure,
     finish,
     lines,
