@@ -1,4 +1,4 @@
-"""Files of results, and errors of runs that failed in part."""
+"""Files of JSON lines, and the errors that scripts report without a traceback."""
 
 from __future__ import annotations
 
