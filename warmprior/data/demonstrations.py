@@ -224,7 +224,6 @@ class Demonstrations:
         *,
         actions: StoredActions = "delta",
         storage: Storage = "memory",
-        scratch_dir: str | Path | None = None,
     ) -> TensorDictBase:
         """Read the demonstrations as one flat, contiguous TensorDict of ``N`` steps.
 
@@ -249,21 +248,20 @@ class Demonstrations:
             actions: pose deltas as recorded; or ``"absolute"``, the poses that they target, of 10 numbers per
                 arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
                 also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
-            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk, and for images the cache, in
-                which the next reader finds them (see :func:`~warmprior.data.frames.cached_images`).
-            scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
+            storage: where images are: in ``"memory"``, or as a ``"memmap"`` of the cache, in which the next
+                reader finds them (see :func:`~warmprior.data.frames.cached_images`).
 
         Raises:
             FileNotFoundError: if there is no such place.
             DatasetError: if it is invalid; the message names the file, demo and key.
             ValueError: if ``storage`` is unknown, or actions of a controller without pose deltas are to be
                 absolute.
-            OSError: if a download fails, or there is no space for memory maps.
+            OSError: if a download fails, or there is no space for images in the cache.
         """
         index = self.index(observations, images, poses=actions == "absolute")
         contents = partial(self.contents, index)
         digest = contents() if storage == "memmap" and index.image_keys else ""
-        options: Any = {"actions": actions, "storage": storage, "scratch_dir": scratch_dir}
+        options: Any = {"actions": actions, "storage": storage}
         with self.reader(index) as reader:
             cached = partial(cached_images, index, reader, digest=digest, contents=contents)
             return read_steps(index, reader, cached, **options)
