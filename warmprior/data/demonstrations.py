@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -125,12 +124,6 @@ class Demonstrations:
             numbers=index.numbers,
         )
 
-    def first(self, demos: int) -> Self:
-        """Return the first `demos` of these demonstrations."""
-        fewer = copy.copy(self)
-        fewer.demos = demos
-        return fewer
-
     def check(self) -> None:
         """Check that the place may hold demonstrations; nothing is read or downloaded.
 
@@ -141,7 +134,7 @@ class Demonstrations:
 
     def resolved(self) -> str:
         """Return the place with an absolute path, so that it holds in any working directory."""
-        return str(self)
+        return str(self) if self.prefix else str(Path(self.place).resolve())
 
     def index(
         self,
