@@ -33,7 +33,10 @@ def turning(speed):
 def shared(count=20):
     data = steps([9] * 8)
     data["action"] = data["action"] / len(data)
-    return SharedObservations(data, H, count=count, generator=torch.Generator().manual_seed(0))
+    whole = SharedObservations(data, H)
+    return whole.subset(
+        torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[:count].sort()[0]
+    )
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ def no_work(monkeypatch):
         ("navigation1d", "--chunk 64", ("--chunk", "32", "64")),
         ("mimicgen_tasks", "--download --task stack_d0", ("NVlabs",)),
         ("sigma", f"{HELD_OUT} --chunk 4 8", ("--chunk", "4 8")),
-        ("sigma", f"{HELD_OUT} --measured 5000", ("count=5000",)),
+        ("sigma", f"{HELD_OUT} --measured 5000", ("--measured 5000",)),
         ("budget", FILE, ("--mask train",)),
         ("robomimic", "--mask train", ("--mask", "file")),
         ("curvature", f"{HELD_OUT} --prior regression", ("flow",)),

@@ -1,5 +1,3 @@
-import gc
-import pickle
 import subprocess
 import sys
 import textwrap
@@ -13,7 +11,6 @@ from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import missing
-from tests.processes import apart
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.envs import absolute_actions
 from warmprior.envs.robosuite_tasks import TASKS
@@ -23,13 +20,12 @@ def _state(demo, task):
     return np.concatenate([demo[key] for key in TASKS[task].low_dim_keys], -1)
 
 
-@pytest.mark.parametrize(("task", "storage"), [*((task, "memory") for task in TASKS), ("lift", "memmap")])
-def test_values_equal_what_was_written(tmp_path, task, storage):
+@pytest.mark.parametrize("task", TASKS)
+def test_values_equal_what_was_written(tmp_path, task):
     path = tmp_path / "file.hdf5"
     demos = write_robomimic_file(path, lengths=(12, 1, 30), task=task, failures=(2,))
-    scratch = tmp_path / "scratch" if task == "lift" else None
     demonstrations = RobomimicDemonstrations(path)
-    data = demonstrations.steps(storage=storage, scratch_dir=scratch)
+    data = demonstrations.steps()
     assert data.batch_size == (43,)
     expected = {
         "observation": np.concatenate([_state(demo, task) for demo in demos]),
@@ -56,29 +52,6 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
     assert index.observation_keys == TASKS[task].low_dim_keys
     assert index.env_args == env_args_15(task)
     assert not missing(repr(demonstrations), "3 demonstrations", "43 steps", "object", TASKS[task].env_name)
-
-
-def test_data_is_the_storage(square_file, tmp_path, monkeypatch):
-    path, _ = square_file
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    mapped = {"storage": "memmap"}
-    maps = mapped | {"scratch_dir": tmp_path / "maps"}
-    read = [RobomimicDemonstrations(path).steps(**options) for options in ({}, mapped, maps, maps)]
-    for number, data in enumerate(read):
-        data["action"].fill_(number)
-    for number, data in enumerate(read):  # two have their files in one folder
-        assert (data["action"] == number).all()
-    sent = [pickle.loads(pickle.dumps(data)) for data in read]  # as to a worker process
-    assert [data["action"].unique().tolist() for data in sent] == [[0], [1], [2], [3]]
-    apart(lambda: sent.append(RobomimicDemonstrations(path).steps(**mapped)))()  # a worker leaves nothing
-    files = sorted(tmp_path.rglob("action.memmap"))
-    assert [file.parents[1] for file in files] == [tmp_path / "maps"] * 2 + [tmp_path]
-    part = read[-1][:1].select("action")
-    del data, read
-    gc.collect()
-    assert len(list(tmp_path.rglob("action.memmap"))) == 1 and (part["action"] == 3).all()
-    del part
-    assert not list(tmp_path.rglob("*.memmap"))
 
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):
@@ -111,7 +84,7 @@ def test_absolute_actions_of_deltas_in_the_frame_of_the_base(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's /proc")
 @pytest.mark.slow
-@pytest.mark.parametrize("options", ["", "actions='absolute'", "storage='memmap'"])
+@pytest.mark.parametrize("options", ["", "actions='absolute'"])
 def test_peak_memory(tmp_path, options):
     small, large = tmp_path / "small.hdf5", tmp_path / "large.hdf5"
     write_robomimic_file(small)

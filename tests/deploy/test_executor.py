@@ -118,7 +118,8 @@ def test_measured_delays_on_a_fake_clock():
     """P = 12, H = 6: decisions every 4 steps, or as soon as the last one took effect."""
     durations = [2, 1, 5, 1, 1, 1, 1]
     clock, policy = FakeClock(durations), Scripted(12)
-    executor = running(policy, PreviewPrior(6), execute=4, delay=1, window=3, pool=clock)
+    executor = running(policy, PreviewPrior(6), execute=4, delay=1, window=3)
+    executor._thread = clock
     actions = drive(executor, clock, 31)
     # Every action is the one for the step at which it is executed, whoever is late.
     assert actions[:, 1].tolist() == [float(i) for i in range(31)]
@@ -312,7 +313,6 @@ def test_chunks_that_no_robot_should_get():
     [
         *(({"execute": 6, "delay": 3}, (8, 6, 3, 5)), ({"latency": 5}, (5, 8, 4))),
         *(({"latency": 1.5}, ("latency", 1.5)), ({"execute": 2.5}, ("execute", 2.5))),
-        ({"latency": 1, "pool": FakeClock([])}, ("pool",)),
         ({"prior": None}, ("Scripted", "prior", "action_dim")),
         *(
             ({"delay": 0.06}, (0.06, "control_rate")),
@@ -375,7 +375,8 @@ def test_whatever_is_slow_late_or_fails(prior, count):
     """Actions and histories are of the steps that were executed; some calls wait, and some do not."""
     length, remembered = prior.prediction_length, prior.history_length
     policy, clock = Scripted(length), RandomClock(length, seed=0)
-    executor = running(policy, prior, execute=5, pool=clock)
+    executor = running(policy, prior, execute=5)
+    executor._thread = clock
     done, errors, held, calls = [], 0, 0, 0
     while calls < count:
         calls += 1
@@ -443,7 +444,8 @@ def test_a_delay_behind_what_is_guided():
     """Guidance refuses such delays: the robot goes on all the same."""
     guided = actor(PreviewPrior(6), guidance=RealTimeChunking(horizon=2))
     clock = FakeClock([4, *[1] * 20])
-    executor = AsyncExecutor(guided, execute=4, pool=clock)
+    executor = AsyncExecutor(guided, execute=4)
+    executor._thread = clock
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(40):

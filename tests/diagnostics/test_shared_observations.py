@@ -34,9 +34,8 @@ def test_frames_are_those_with_a_full_history(lengths, horizon):
 
 def test_windows_hold_the_same_observations_and_each_priors_own_history():
     data = steps([10, 3, 8])
-    shared = SharedObservations(data, H, count=6, generator=torch.Generator().manual_seed(0))
+    shared = SharedObservations(data, H)
     frames = shared.frames
-    assert len(frames.unique()) == 6
     past = shared.windows(PastPrior(H))
     assert (past["history", "steps"] == H).all()
     expected = frames[:, None] + torch.arange(-H, 0)
@@ -73,7 +72,6 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
 
 def test_bad_input_is_named():
     data = steps([5, 4])
-    refuses(lambda: SharedObservations(data, H, count=100), ValueError, "count=100", "3 of 9")
     refuses(lambda: SharedObservations(data, H).windows(PastPrior(H + 1)), ValueError, "chunk length")
     for offset in (-1, H + 1):
         with raises(ValueError, "offset", 0, H):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -125,12 +124,6 @@ class Demonstrations:
             numbers=index.numbers,
         )
 
-    def first(self, demos: int) -> Self:
-        """Return the first `demos` of these demonstrations."""
-        fewer = copy.copy(self)
-        fewer.demos = demos
-        return fewer
-
     def check(self) -> None:
         """Check that the place may hold demonstrations; nothing is read or downloaded.
 
@@ -141,7 +134,7 @@ class Demonstrations:
 
     def resolved(self) -> str:
         """Return the place with an absolute path, so that it holds in any working directory."""
-        return str(self)
+        return str(self) if self.prefix else str(Path(self.place).resolve())
 
     def index(
         self,
@@ -224,7 +217,6 @@ class Demonstrations:
         *,
         actions: StoredActions = "delta",
         storage: Storage = "memory",
-        scratch_dir: str | Path | None = None,
     ) -> TensorDictBase:
         """Read the demonstrations as one flat, contiguous TensorDict of ``N`` steps.
 
@@ -249,21 +241,20 @@ class Demonstrations:
             actions: pose deltas as recorded; or ``"absolute"``, the poses that they target, of 10 numbers per
                 arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
                 also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
-            storage: ``"memory"``, or ``"memmap"`` for temporary files on a disk, and for images the cache, in
-                which the next reader finds them (see :func:`~warmprior.data.frames.cached_images`).
-            scratch_dir: a folder for these files; by default the system's (``TMPDIR``).
+            storage: where images are: in ``"memory"``, or as a ``"memmap"`` of the cache, in which the next
+                reader finds them (see :func:`~warmprior.data.frames.cached_images`).
 
         Raises:
             FileNotFoundError: if there is no such place.
             DatasetError: if it is invalid; the message names the file, demo and key.
             ValueError: if ``storage`` is unknown, or actions of a controller without pose deltas are to be
                 absolute.
-            OSError: if a download fails, or there is no space for memory maps.
+            OSError: if a download fails, or there is no space for images in the cache.
         """
         index = self.index(observations, images, poses=actions == "absolute")
         contents = partial(self.contents, index)
         digest = contents() if storage == "memmap" and index.image_keys else ""
-        options: Any = {"actions": actions, "storage": storage, "scratch_dir": scratch_dir}
+        options: Any = {"actions": actions, "storage": storage}
         with self.reader(index) as reader:
             cached = partial(cached_images, index, reader, digest=digest, contents=contents)
             return read_steps(index, reader, cached, **options)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from multiprocessing.util import Finalize
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -30,7 +26,6 @@ from warmprior.data.index import (
 )
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
-from warmprior.io.files import reserve, storing
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
@@ -48,7 +43,6 @@ def read_steps(
     *,
     actions: StoredActions = "delta",
     storage: Storage = "memory",
-    scratch_dir: str | Path | None = None,
 ) -> TensorDict:
     """Return the values of demonstrations; see :meth:`Demonstrations.steps` for entries and options.
 
@@ -58,14 +52,12 @@ def read_steps(
     check_choice("actions", actions, get_args(StoredActions))
     conventions = _conventions(index, actions == "absolute")
     action_dim = index.action_dim if conventions is None else 10 * len(conventions[1])
-    data = _allocate(index, action_dim, storage, scratch_dir)
+    data = _allocate(index, action_dim, index.image_keys if storage == "memory" else ())
     _fill(index, data, reader, _actions(index, reader, conventions, actions))
-    if storage == "memory":
-        for key in index.image_keys:
+    for key in index.image_keys:
+        if storage == "memory":
             read_images(index, reader, key, data[OBSERVATION, key])
-    elif index.image_keys:
-        data = data.clone(False)  # a map in files of its own takes no others
-        for key in index.image_keys:
+        else:
             data[OBSERVATION, key] = cached(key)
     return data
 
@@ -118,16 +110,14 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float:
     return float(np.square(part).sum()) / of if of else np.inf
 
 
-def _allocate(
-    index: DatasetIndex, action_dim: int, storage: str, scratch_dir: str | Path | None
-) -> TensorDict:
+def _allocate(index: DatasetIndex, action_dim: int, images: Sequence[str]) -> TensorDict:
+    """Return memory for the values, and for these images; raise DatasetError if there is not enough."""
     steps = sum(index.lengths)
     vector = (torch.float32, (sum(index.observation_dims),))
     image = (torch.uint8, image_shape(index)[1:])
-    allocated = index.image_keys if storage == "memory" else ()  # others are maps of the cache
     widths = {
         _vector_key(index): vector,
-        **{(OBSERVATION, key): image for key in allocated},
+        **{(OBSERVATION, key): image for key in images},
         ACTION: (torch.float32, (action_dim,)),
         ("next", "reward"): (torch.float32, (1,)),
         **{("next", flag): (torch.bool, (1,)) for flag in ("done", "terminated", "truncated")},
@@ -139,41 +129,17 @@ def _allocate(
     for key, (dtype, width) in widths.items():
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
     needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
-    if storage == "memory":
-        if needed > (free := available_memory()):
-            raise DatasetError(
-                f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but {free / 1e9:.1f} GB "
-                "are free: use storage='memmap' or fewer demos"
-            )
-        return torch.empty_like(data)
-    place = Path(tempfile.gettempdir() if scratch_dir is None else scratch_dir)
-    what, elsewhere = (
-        f"{place}: cannot store {needed / 1e9:.3g} GB for {index.path}",
-        "another scratch_dir (TMPDIR)",
-    )
-    with storing(what, place, elsewhere):
-        place.mkdir(parents=True, exist_ok=True)
-        # A folder of its own, because another reader may use the same one. It is removed by this process
-        # alone, also where the end of a worker process calls no other finalizers.
-        folder = tempfile.mkdtemp(dir=place)
-        data = data.memmap_like(folder)
-        mapped: list[str] = []
-        for value in data.values(True, True):
-            mapped.append(value.filename)
-            Finalize(value.untyped_storage(), _release, (folder, mapped), exitpriority=0)
-            reserve(value)
-    return data
+    if needed > (free := available_memory()):
+        advice = "storage='memmap' or " if images else ""
+        raise DatasetError(
+            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but {free / 1e9:.1f} GB are "
+            f"free: use {advice}fewer demos"
+        )
+    return torch.empty_like(data)
 
 
 def _vector_key(index: DatasetIndex) -> NestedKey:
     return (OBSERVATION, STATE) if index.image_keys else OBSERVATION
-
-
-def _release(folder: str, mapped: list[str]) -> None:
-    """Remove a folder after the last of its memory maps; processes that these are sent to open the files."""
-    mapped.pop()
-    if not mapped:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:

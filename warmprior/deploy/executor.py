@@ -7,7 +7,7 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Mapping
-from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from threading import RLock
 from typing import Any, Self
@@ -77,7 +77,6 @@ class AsyncExecutor:
         timeout: seconds to wait for a late chunk once no action is left; ``None`` waits without limit.
         latency: simulated delay: chunks are computed in the calling thread and take effect this many control
             steps later.
-        pool: executor in which chunks are computed; by default one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
 
     Raises:
@@ -108,7 +107,6 @@ class AsyncExecutor:
         normalizer: Normalizer | None = None,
         timeout: float | None = 0.0,
         latency: int | None = None,
-        pool: Executor | None = None,
         action_dim: int | None = None,
     ) -> None:
         plain = uncompiled(actor)
@@ -122,8 +120,6 @@ class AsyncExecutor:
         check_usual_keys(actor, "AsyncExecutor")
         if prior is None or action_dim is None:
             raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
-        if latency is not None and pool is not None:
-            raise ValueError("a simulated latency computes in the calling thread: leave out pool")
         check_whole_numbers(window=window, observation_steps=observation_steps, **given(execute=execute))
         check_whole_numbers(0, **given(latency=latency))
         check_not_negative(**given(timeout=timeout))
@@ -160,10 +156,9 @@ class AsyncExecutor:
             recording,
         )
         self._sees_history = keys.CONDITIONED in actor.in_keys
-        self._owned = None
-        if pool is None and latency is None:
-            self._owned = pool = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
-        self._pool = pool
+        self._thread = None
+        if latency is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
         self._expected = expected
         self._delays: deque[int] = deque(maxlen=window)
         self._stacked = observation_steps
@@ -261,10 +256,10 @@ class AsyncExecutor:
                 frames.batch_size = []  # the steps belong to the entries
             delay = torch.tensor([min(self.expected_delay, left, self._reach)])
             data = TensorDict({keys.OBSERVATION: frames, keys.HISTORY: self._history, keys.DELAY: delay})
-            if self._pool is None:
+            if self._thread is None:
                 decision.set_result(self._compute(data))
             else:
-                decision = self._pool.submit(self._compute, data)
+                decision = self._thread.submit(self._compute, data)
         except Exception as error:  # kept as the decision's result, as by a thread
             decision.set_exception(error)
         self._pending = decision
@@ -316,17 +311,17 @@ class AsyncExecutor:
                 f"no action is left after {self._executed} control steps and {self.timeout} s. Hold the "
                 "robot and call again; execute fewer actions, or predict longer chunks"
             ) from late
-        except CancelledError:  # the owner of the pool may cancel it
+        except CancelledError:  # by another thread that closes the executor
             pass
         self._collect()
 
     def close(self) -> None:
-        """End the thread after the current decision; a pool passed as an argument is not closed."""
+        """End the thread after the current decision."""
         self._closed = True
         if (pending := self._pending) is not None:
             pending.cancel()
-        if self._owned is not None:
-            self._owned.shutdown(cancel_futures=True)
+        if self._thread is not None:
+            self._thread.shutdown(cancel_futures=True)
 
     def __enter__(self) -> Self:
         return self

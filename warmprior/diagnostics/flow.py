@@ -228,12 +228,9 @@ class SharedObservations:
             measure.
         chunk_length: ``H``.
         observation_steps: ``To``.
-        count: number of observations to draw, without replacement; all by default.
-        generator: draws the observations, on the CPU; PyTorch's global generator by default.
 
     Raises:
         KeyError: if the data lack a key.
-        ValueError: if there are fewer observations than ``count``.
 
     Examples:
         >>> from warmprior import PastPrior
@@ -244,28 +241,14 @@ class SharedObservations:
         (360, torch.Size([360, 4, 1]))
     """
 
-    def __init__(
-        self,
-        data: TensorDictBase,
-        chunk_length: int,
-        *,
-        observation_steps: int = 1,
-        count: int | None = None,
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, data: TensorDictBase, chunk_length: int, *, observation_steps: int = 1) -> None:
         self.data, self.chunk_length = data, chunk_length
         self.observation_steps = observation_steps
         check_keys(data, [keys.EPISODE], "SharedObservations")
         episode = data.get(keys.EPISODE).flatten().cpu()
         first = torch.arange(len(episode)) - chunk_length
-        frames = ((first >= 0) & (episode[first.clamp_min(0)] == episode)).nonzero().flatten()
-        if count is not None:
-            if not 1 <= count <= len(frames):
-                have = f"{len(frames)} of {len(episode)} steps have {chunk_length} before them"
-                raise ValueError(f"count={count} observations, but {have} in their episode")
-            frames = frames[torch.randperm(len(frames), generator=generator)[:count]].sort()[0]
-        self.frames = frames
-        self.episodes = episode[frames]
+        self.frames = ((first >= 0) & (episode[first.clamp_min(0)] == episode)).nonzero().flatten()
+        self.episodes = episode[self.frames]
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -41,6 +41,14 @@ def has_anchor(actor: Any) -> bool:
     return bool(checked_mean(prior, history)[1].any())
 
 
+def check_source_space(actor: Any) -> None:
+    """Raise ValueError unless the start of a policy's flow, which an agent chooses, decides the chunk."""
+    if actor.ode.guidance is not None:
+        raise ValueError("the agent alone must decide the chunk: use actor.replace(guidance=None)")
+    if actor.sampling.max_nfe == 1:
+        raise ValueError("the policy is trained at t = 0 alone, so an agent has no source space to act in")
+
+
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the centre of the source, ``[*B, P, d_a]``, and a mask of valid positions, bool ``[*B, P, 1]``.
 

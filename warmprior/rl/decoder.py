@@ -16,7 +16,7 @@ from warmprior import keys
 from warmprior.checks import check_choice, check_keys, check_positive, check_shape, check_whole_numbers
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
 from warmprior.modules.generator import Drawing
-from warmprior.rl.anchor import has_anchor, held, length_of_residuals, residual_sigma
+from warmprior.rl.anchor import check_source_space, has_anchor, held, length_of_residuals, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
 
@@ -67,14 +67,7 @@ class PriorDecoder(TensorDictModuleBase):
         super().__init__()
         check_positive(delta=delta)
         check_usual_keys(actor, "PriorDecoder")
-        if actor.sampling.max_nfe == 1:
-            raise ValueError(
-                "the policy is trained at t = 0 alone, so it has no flow from a source space to act in"
-            )
-        if actor.ode.guidance is not None:
-            raise ValueError(
-                "the agent's residual alone must decide the chunk: use actor.replace(guidance=None)"
-            )
+        check_source_space(actor)
         self.delta = float(delta)
         self.ode = copy.deepcopy(actor.ode)
         self.normalizer = copy.deepcopy(actor.normalizer)

@@ -17,8 +17,9 @@ from warmprior import keys
 from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.rl.anchor import has_anchor, held, source_anchor
+from warmprior.rl.anchor import check_source_space, has_anchor, held, source_anchor
 from warmprior.rl.networks import make_prior_space_actor
+from warmprior.saving.checkpoint import as_key
 
 _READ = (keys.ANCHOR, keys.ACTIONS)
 """What agents read beside the observation."""
@@ -70,8 +71,8 @@ class AgentStart(StartPoint):
         self.start = from_config(StartPoint, start) if isinstance(start, dict) else start
         self.time = 0.0 if self.start is None else self.start.time
         self.agent, self.greedy = dict(agent), greedy
-        self.observation_key = _as_key(observation_key)
-        read = [_as_key(key) for key in agent.get("in_keys", (self.observation_key, keys.ANCHOR))]
+        self.observation_key = as_key(observation_key)
+        read = [as_key(key) for key in agent.get("in_keys", (self.observation_key, keys.ANCHOR))]
         self.module = make_prior_space_actor(**{**agent, "in_keys": read})
         self.moves = has_anchor(
             SimpleNamespace(prior=self.prior, start=self.start, network=SimpleNamespace(**agent))
@@ -93,17 +94,9 @@ class AgentStart(StartPoint):
         return anchor + held(delta, anchor.shape[-2]).to(anchor.dtype)
 
 
-def _as_key(key: Any) -> Any:
-    """Return a key, which JSON holds as a list if it is nested."""
-    return tuple(key) if isinstance(key, list) else key
-
-
 def check_improvable(actor: WarmPriorActor) -> None:
     """Raise ValueError if no agent can become part of the policy, for its guidance, times or images."""
-    if actor.ode.guidance is not None:
-        raise ValueError("the agent alone must decide the chunk: use actor.replace(guidance=None)")
-    if actor.sampling.max_nfe == 1:
-        raise ValueError("the policy is trained at t = 0 alone, so an agent has no source space to act in")
+    check_source_space(actor)
     if getattr(actor.network, "encodes", False):
         raise ValueError("the agent of a policy that sees images reads features, which no policy gives it")
 
@@ -148,7 +141,7 @@ def improved_policy(
     if options is None:
         raise TypeError(f"need an agent from make_prior_space_actor, got {type(agent).__name__}")
     check_improvable(actor)
-    read = [_as_key(key) for key in options["in_keys"]]
+    read = [as_key(key) for key in options["in_keys"]]
     if unknown := [key for key in read if key not in (actor.observation_key, *_READ)]:
         raise ValueError(
             f"the agent reads {unknown}, but a policy has {[actor.observation_key, *_READ]} for it"

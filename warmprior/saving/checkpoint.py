@@ -179,10 +179,10 @@ def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> No
 
 def as_key(value: Any) -> NestedKey:
     """Return a tensordict's key from JSON, which holds nested keys as lists."""
-    parts = value if isinstance(value, list) else [value]
+    parts = value if isinstance(value, list | tuple) else [value]
     if not parts or not all(isinstance(part, str) for part in parts):
         raise ValueError(f"{value!r} is not a key")
-    return tuple(value) if isinstance(value, list) else value
+    return value if isinstance(value, str) else tuple(value)
 
 
 def named(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -130,8 +130,11 @@ def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservatio
                 f"data, {facts['file']}: choose masks, or a --validation, without them"
             )
         words = TRAINED_ON
-    data = data.to(device)
-    return SharedObservations(data, chunk_length, **shape, count=count, generator=generator), words or called
+    shared = SharedObservations(data.to(device), chunk_length, **shape)
+    if count > len(shared):
+        have = f"{len(shared)} of the {len(data)} steps of {called} have {chunk_length} before them"
+        raise ValueError(f"--measured {count}, but {have}: measure fewer")
+    return shared.subset(torch.randperm(len(shared), generator=generator)[:count].sort()[0]), words or called
 
 
 def _episodes(data: TensorDictBase) -> list[str]:

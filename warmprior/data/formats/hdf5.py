@@ -374,10 +374,6 @@ class RobomimicDemonstrations(Demonstrations):
             raise FileNotFoundError(f"{self.place}: no such file")
 
     @override
-    def resolved(self) -> str:
-        return str(self.path.resolve())
-
-    @override
     def index(
         self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
     ) -> DatasetIndex:

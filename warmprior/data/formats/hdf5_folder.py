@@ -46,10 +46,6 @@ class RobomimicFolder(Demonstrations):
             raise FileNotFoundError(f"{self.place}: no file *.hdf5 in this folder; {other}")
 
     @override
-    def resolved(self) -> str:
-        return str(Path(self.place).resolve())
-
-    @override
     def index(
         self, observations: Sequence[str] | None = None, images: Sequence[str] = (), *, poses: bool = False
     ) -> DatasetIndex:
