@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from lab.methods.methods import METHODS
+from warmprior import modules
 from warmprior.modules.prior import Prior
 
 ROOT = Path(__file__).parents[1]
@@ -78,7 +79,7 @@ def test_what_happens_without_an_option_is_said_once(helps):
 
 def test_help_names_every_source_and_method(helps):
     """Help is written by hand, since the tables of both need PyTorch."""
-    sources = {name for name, kind in Prior.classes.items() if kind.__module__.startswith("warmprior.")}
+    sources = {name for name, kind in Prior.classes.items() if getattr(modules, kind.__name__, None) is kind}
     for name, known in (("warmprior.__main__ train", sources), ("robomimic", set(METHODS))):
         said = re.findall(r"[\w-]+", options_of(helps[name])["--prior"])
         assert "past" in known and not known - set(said), name
