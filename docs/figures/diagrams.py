@@ -8,13 +8,14 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from shared import DOCS, INK, SVG
+from shared import CVAE, DOCS, INK, SOURCES, SVG
 
 OUT = DOCS / "_static"
-GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
+GREY, BLUE, ORANGE, LEARNED, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", SOURCES[CVAE][1], "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several routes)?", "PastPrior(8), nfe=3", BLUE),
     ("Are actions absolute joint targets,\nor absolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
+    ("Human demonstrations, without\ncameras?", "CVAEPrior(8), nfe=9", LEARNED),
     ("At most 25 scripted demos, and time\nfor NFE 1 only?", "PastPrior(8), nfe=1", BLUE),
 )
 
@@ -39,8 +40,8 @@ def box(
 
 def flowchart() -> None:
     """Draw chart H: the choice of a source."""
-    picture, axis = canvas(6.4, 3.7)
-    left, right, step, top = 17.0, 51.0, 9.2, 32.4
+    picture, axis = canvas(6.4, 4.62)
+    left, right, step, top = 17.0, 51.0, 9.2, 41.6
     for k, (question, answer, color) in enumerate(QUESTIONS):
         y = top - step * k
         box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
