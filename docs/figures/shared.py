@@ -41,6 +41,10 @@ SOURCES = {  # label, colour and marker in charts
     "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
 }
 SOURCES |= {name: (each.label, each.color, "o") for name, each in METHODS.items() if name not in SOURCES}
+SOURCES |= {
+    f"{name},l1": (f"{SOURCES[name][0]}, L1 loss", SOURCES[name][1], "v")
+    for name in (CVAE, f"{CVAE}-history")
+}
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 
 
