@@ -14,7 +14,7 @@ OUT = DOCS / "_static"
 GREY, BLUE, ORANGE, LEARNED, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", SOURCES[CVAE][1], "#eeeeee"
 QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several routes)?", "PastPrior(8), nfe=3", BLUE),
-    ("Are actions absolute joint targets,\nor absolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
+    ("Do you set joints=, or are actions\nabsolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
     ("Human demonstrations, without\ncameras?", "CVAEPrior(8), nfe=9", LEARNED),
     ("At most 25 scripted demos, and time\nfor NFE 1 only?", "PastPrior(8), nfe=1", BLUE),
 )

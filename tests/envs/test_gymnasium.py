@@ -1,14 +1,18 @@
+import threading
+from dataclasses import replace
+
 import pytest
 import torch
 
 pytest.importorskip("gymnasium")
 
+import cloudpickle
 import gymnasium
 import numpy as np
 from torchrl.envs import SerialEnv
 
 from tests.errors import raises, refuses
-from warmprior.envs.gymnasium import gym_env, registered_env
+from warmprior.envs.gymnasium import gym_env, registered_builder, registered_env
 
 
 class Dial(gymnasium.Env):
@@ -169,6 +173,24 @@ def registered_dial(monkeypatch):
     gymnasium.register("Dial-v0", Dial)
     monkeypatch.setitem(gymnasium.registry, "Dial-v0", gymnasium.registry.pop("Dial-v0"))
     return {"id": "Dial-v0", "max_episode_steps": 4, "success": "solved"}
+
+
+def test_a_builder_takes_the_entry_with_it_if_it_can(monkeypatch):
+    described = registered_dial(monkeypatch)
+    sent = cloudpickle.dumps(registered_builder(described))
+    entry, lock = gymnasium.registry["Dial-v0"], threading.Lock()
+    # Another process has something else under this name.
+    monkeypatch.setitem(gymnasium.registry, "Dial-v0", gymnasium.registry["Pendulum-v1"])
+    assert isinstance(cloudpickle.loads(sent)().base_env._env.unwrapped, Dial)
+    assert gymnasium.registry["Dial-v0"] is not entry
+
+    def locked():
+        with lock:  # which cannot be sent
+            return Dial()
+
+    monkeypatch.setitem(gymnasium.registry, "Dial-v0", replace(entry, entry_point=locked))
+    sent = cloudpickle.dumps(registered_builder(described))
+    assert isinstance(cloudpickle.loads(sent)().base_env._env.unwrapped, Dial)
 
 
 def test_a_registered_environment_numbers_its_episodes_if_asked(monkeypatch):

@@ -45,11 +45,9 @@ def test_the_loss_is_its_equation():
     prior = prior_for(hidden_dim=8, latent_dim=3, beta=0.7)
     g = torch.Generator().manual_seed(0)
     a1, seen = torch.randn(5, H, D_A, generator=g), torch.randn(5, 1, D_O, generator=g)
-    history = random_history(prior, 5, action_dim=D_A)
     for inside in (torch.ones(5, H, 1), torch.tensor([[1.0, 1], [1, 0], [1, 1], [1, 0], [1, 1]])[..., None]):
         windows = {"vla_action": {"chunk": a1}, "action_is_pad": inside[..., 0] == 0, "observation": seen}
-        windows = TensorDict(windows | {"history": history}, [5])
-        found = prior.learning_loss(windows, torch.Generator().manual_seed(1))
+        found = prior.learning_loss(TensorDict(windows, [5]), torch.Generator().manual_seed(1))
         code = prior.encoder(torch.cat([seen.flatten(1), (a1 * inside).flatten(1)], -1))
         mean, deviation = code[:, :3], (0.5 * code[:, 3:]).exp()
         z = mean + deviation * torch.randn(5, 3, generator=torch.Generator().manual_seed(1))

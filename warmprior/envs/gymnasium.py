@@ -11,6 +11,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
+import cloudpickle
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
@@ -166,15 +167,6 @@ REGISTERING = ("gymnasium_robotics", "gym_pusht")
 """The packages that register environments when imported; they are imported if installed."""
 
 
-def _is_known(name: str) -> bool:
-    """Return True if an environment is registered, after an import of what might register it."""
-    registry = importlib.import_module("gymnasium").registry
-    for package in REGISTERING if name not in registry else ():
-        if find_spec(package) is not None:
-            importlib.import_module(package)
-    return name in registry
-
-
 def registered_env(
     description: Mapping[str, Any],
     *,
@@ -184,6 +176,7 @@ def registered_env(
     seed_offset: int = 0,
     seed_stride: int | None = None,
     render_mode: str | None = None,
+    entry: Any = None,
 ) -> TransformedEnv:
     """Build an environment of Gymnasium's registry from a description in data or a policy.
 
@@ -202,6 +195,7 @@ def registered_env(
         seed_stride: episode ``n`` after ``set_seed(seed)`` starts with ``seed + seed_offset + n *
             seed_stride``, as in :class:`RobosuiteEnv`; by default only the first follows from a seed.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
+        entry: the ``EnvSpec`` to build; by default the one that is registered under the name.
 
     Raises:
         ImportError: if no environment with this name is registered.
@@ -218,7 +212,10 @@ def registered_env(
     check_whole_numbers(**given(seed_stride=seed_stride))
     gymnasium = importlib.import_module("gymnasium")
     name, wrappers = description["id"], description.get("wrappers")
-    if not _is_known(name):
+    for package in REGISTERING if name not in gymnasium.registry else ():
+        if find_spec(package) is not None:
+            importlib.import_module(package)
+    if entry is None and name not in gymnasium.registry:
         raise ImportError(
             f"Gymnasium has no environment {name!r}: install the package that registers it, and import that "
             "before (gymnasium-robotics: pip install --no-deps gymnasium-robotics pettingzoo imageio)"
@@ -232,7 +229,7 @@ def registered_env(
     kwargs, rendered = description.get("kwargs") or {}, given(render_mode=render_mode)
     try:
         env = gymnasium.make(
-            name,
+            name if entry is None else entry,
             max_episode_steps=description.get("max_episode_steps") if horizon is None else horizon,
             **{key: value for key, value in kwargs.items() if key != "render_mode"} | rendered,
         )
@@ -262,14 +259,12 @@ def registered_env(
 def registered_builder(description: Mapping[str, Any], **options: Any) -> Callable[..., TransformedEnv]:
     """Return a builder, see :func:`registered_env`, that other processes can use as well.
 
-    A spawned process lacks what a script or a module of the user's has registered in this one: Gymnasium's
-    entry goes with the builder.
+    A spawned process lacks what a script of the user's has registered in this one, so Gymnasium's entry goes
+    with the builder if it can be sent.
     """
     entry = importlib.import_module("gymnasium").registry.get(description["id"])
-    return partial(_build, entry, description, **options)
-
-
-def _build(entry: Any, *args: Any, **options: Any) -> TransformedEnv:
-    if entry is not None and not _is_known(entry.id):
-        importlib.import_module("gymnasium").registry[entry.id] = entry
-    return registered_env(*args, **options)
+    try:
+        cloudpickle.dumps(entry)
+    except Exception:  # the environment's own, of any class: another process has to register it itself
+        entry = None
+    return partial(registered_env, description, entry=entry, **options)

@@ -35,8 +35,9 @@ class _StridedEnv(ParallelEnv):
         except (ConnectionError, EOFError) as error:
             raise WorkerError(
                 "a worker ended before it had built its environment, which this process can build; its own "
-                "error is above. Workers that are spawned, as where there is a GPU, know what modules do as "
-                "they are imported, and nothing else of this process: do there what the environment needs"
+                "error, if it had one, is above. Workers that are spawned, as with a GPU, know what "
+                "modules do as they are imported, and nothing else of this process: do there what the "
+                "environment needs"
             ) from error
 
 

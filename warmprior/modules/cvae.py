@@ -107,7 +107,7 @@ class CVAEPrior(Prior, nn.Module):
         """Return the width of :meth:`network_input`."""
         return observation_steps * observation_dim
 
-    def network_input(self, history: TensorDictBase, observation: Tensor) -> Tensor:
+    def network_input(self, history: TensorDictBase | None, observation: Tensor) -> Tensor:
         """Return what encoder and decoder read: the observation ``[*B, To, d_o]`` as ``[*B, To d_o]``."""
         return observation.flatten(-2).to(self.decoder[0].weight.dtype)
 
@@ -141,7 +141,7 @@ class CVAEPrior(Prior, nn.Module):
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """Return the loss above on windows."""
-        inputs = self.network_input(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        inputs = self.network_input(windows.get(keys.HISTORY, None), windows[keys.OBSERVATION])
         target = windows[keys.CHUNK].to(inputs.dtype)
         inside = ~windows[keys.IS_PAD].unsqueeze(-1)
         encoded = self.encoder(torch.cat([inputs, (target * inside).flatten(-2)], -1))

@@ -206,7 +206,7 @@ class CVAEHistoryPrior(CVAEPrior):
         observed = super().input_dim(action_dim, observation_dim, observation_steps)
         return observed + self.chunk_length * action_dim + 1
 
-    def network_input(self, history: TensorDictBase, observation: Tensor) -> Tensor:
+    def network_input(self, history: Any, observation: Tensor) -> Tensor:
         observed = super().network_input(history, observation)
         return torch.cat([observed, last_chunk(history, self.chunk_length).to(observed.dtype)], -1)
 

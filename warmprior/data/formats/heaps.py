@@ -7,7 +7,9 @@ size to size: where damage makes one zero it walks on the spot for ever, and Ctr
 from __future__ import annotations
 
 import io
-from collections.abc import Buffer
+import os
+from collections.abc import Buffer, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, override
 
@@ -21,20 +23,37 @@ _HEAP = b"GCOL\x01"  # HDF5 refuses other versions
 _ALIGNED = 8  # bytes
 
 
-class _HeapsChecked(io.BufferedReader):
-    """A file that HDF5 reads through Python, and that raises DatasetError for a damaged heap."""
+class _HeapsChecked(io.FileIO):
+    """A file that HDF5 reads through Python, and that raises DatasetError for a damaged heap.
+
+    It keeps its position itself, since the system's is shared with forked processes.
+    """
 
     size_bytes = 8
     """The width of sizes in the file."""
+    place = 0
+
+    @override
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        self.place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self.place}.get(
+            whence, os.fstat(self.fileno()).st_size
+        )
+        return self.place
+
+    @override
+    def tell(self) -> int:
+        return self.place
 
     @override
     def readinto(self, buffer: Buffer, /) -> int:
-        start, content = self.tell(), memoryview(buffer)
-        count = super().readinto(buffer)
-        if count < len(content):  # h5py would take the rest of the buffer as it is
-            raise OSError("it ends early")
+        content, count = memoryview(buffer), 0
+        while count < len(content):
+            new = os.preadv(self.fileno(), [content[count:]], self.place + count)
+            if not new:  # h5py would take the rest of the buffer as it is
+                raise OSError("it ends early")
+            count += new
         if bytes(content[: len(_HEAP)]) == _HEAP:
-            self._check_heap(start)
+            self._check_heap(self.place)
         return count
 
     def _check_heap(self, start: int) -> None:
@@ -52,16 +71,16 @@ class _HeapsChecked(io.BufferedReader):
 
     def _header(self, place: int, length: int) -> tuple[int, int]:
         """Return the number and the size in a header."""
-        self.seek(place)
-        header = self.read(length)
+        header = os.pread(self.fileno(), length, place)
         if len(header) < length:
             raise OSError("it ends early")
         return int.from_bytes(header[:2], "little"), int.from_bytes(header[8 : 8 + self.size_bytes], "little")
 
 
-def open_checked(path: Path) -> h5py.File:
+@contextmanager
+def open_checked(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading, so that a damaged heap of strings ends in a DatasetError."""
-    checked = _HeapsChecked(io.FileIO(path))
-    file = require("h5py", "sim").File(path, "r", driver="fileobj", fileobj=checked)
-    checked.size_bytes = file.id.get_create_plist().get_sizes()[1]
-    return file
+    h5py = require("h5py", "sim")
+    with _HeapsChecked(path) as checked, h5py.File(path, "r", driver="fileobj", fileobj=checked) as file:
+        checked.size_bytes = file.id.get_create_plist().get_sizes()[1]
+        yield file
