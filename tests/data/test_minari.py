@@ -152,7 +152,7 @@ def test_no_dataset_is_read_that_holds(root, tmp_path, fault, name):
 
 @pytest.mark.parametrize("place", ["options", "infos"])
 def test_a_heap_of_strings_over_which_hdf5_walks_for_ever(root, monkeypatch, place):
-    """Of what Minari reads: the options of a reset, and what a step reported."""
+    """Minari reads the options of a reset, and what a step reported."""
     dataset = written()
     (path,) = root.rglob("main_data.hdf5")
     with h5py.File(path, "a") as file:
