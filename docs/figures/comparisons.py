@@ -60,7 +60,7 @@ class Comparison:
     @property
     def in_trainings(self) -> str:
         """The trainings ahead and behind in words."""
-        return f"ahead in {self.ahead} of {self.trainings} trainings and behind in {self.behind}"
+        return f"ahead in {self.ahead} of {self.trainings} training runs and behind in {self.behind}"
 
     @property
     def points(self) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from comparisons import Comparison
 from leaderboard import SCRIPTED, beside_source, paper_gain, standings
 from pandas import DataFrame
 from results import (
@@ -15,6 +16,7 @@ from results import (
     GROUPS,
     LENGTHS,
     LONG,
+    MANY,
     SHORT,
     TEN,
     TWENTY_FIVE,
@@ -69,6 +71,17 @@ def gain(runs: Iterable[str], source: str, nfe: int) -> float:
     return mean(runs, source, nfe) - mean(runs, GAUSSIAN, nfe)
 
 
+def chances(comparisons: Iterable[Comparison]) -> str:
+    """Return the p-values of comparisons as a sentence has them."""
+    return ", ".join(comparison.chance for comparison in comparisons)
+
+
+def beside_gaussian(runs: Iterable[str], source: str) -> str:
+    """Return the mean success of a source and the Gaussian source over the tasks of some runs, by NFE."""
+    rates = (spaced(mean(runs, name, nfe) for nfe in (9, 3, 1)) for name in (source, GAUSSIAN))
+    return " against ".join(f"{each}%" for each in rates)
+
+
 def sentences() -> dict[str, list[str]]:
     """Return the sentences of each page."""
     board = standings().set_index(["source", "nfe"])
@@ -80,6 +93,7 @@ def sentences() -> dict[str, list[str]]:
     long_rates, better_rates, default_rates = (
         [spaced(c.rates[k] for c in of) for k in (0, 1)] for of in (long, better, correlated_long)
     )
+    scripted = {name: beside_gaussian(GROUPS[name], CORRELATED) for name in (TWENTY_FIVE, MANY)}
     lengths = read_cells((SHORT[-1], LONG[-1]), common_seeds=True).query("nfe == 1")
     transport = [
         whole(lengths[(lengths["run"] == runs[-1]) & (lengths["source"] == s)]["success"].mean())
@@ -105,24 +119,26 @@ def sentences() -> dict[str, list[str]]:
     paper = {s: " / ".join(f"{paper_gain(s, nfe):.1f}" for nfe in (9, 3, 1)) for s in (PAST, PREVIEW)}
     return {
         "../README.md": [
-            f"{rates[PAST, 9]}% and {rates[GAUSSIAN, 9]}% ({past.in_trainings}, {past.chance})",
-            f"{rates[PAST, 1]}% and {rates[GAUSSIAN, 1]}% at NFE 1, perhaps by chance",
-            f"{span(few)} points more at NFE 1",
+            f"{rates[PAST, 9]}% against {rates[GAUSSIAN, 9]}% ({past.in_trainings}, {past.chance})",
+            f"The difference at NFE 1, {rates[PAST, 1]}% against {rates[GAUSSIAN, 1]}%, may be due to chance",
+            f"WP-Past and WP-Preview score {span(few)} points more at NFE 1",
             f"({past_once.in_trainings}, {past_once.chance})",
             f"{span(short)} points less at NFE 1 after short training",
-            f"with WP-Past**: {long_rates[0]}% and {long_rates[1]}% ({', '.join(c.chance for c in long)})",
-            f"clear difference**: {better_rates[0]}% and {better_rates[1]}%",
-            f"{default_rates[0]}% and {default_rates[1]}% ({', '.join(c.chance for c in correlated_long)})",
-            f"at NFE 9 ({rates[CORRELATED, 9]}% and {rates[GAUSSIAN, 9]}%) may be chance",
-            f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% at NFE 9 ({learned[9].chance} against the "
-            "Gaussian source)",
+            f"with WP-Past**: {long_rates[0]}% against {long_rates[1]}% ({chances(long)})",
+            f"clear difference** for WP-Past: {better_rates[0]}% against {better_rates[1]}%",
+            f"{default_rates[0]}% against {default_rates[1]}% ({chances(correlated_long)})",
+            f"the four human sets at NFE 9 ({rates[CORRELATED, 9]}% against {rates[GAUSSIAN, 9]}%)",
+            f"with 25 scripted demonstrations ({scripted[TWENTY_FIVE]})",
+            f"with 300 after 80,000 iterations ({scripted[MANY]})",
+            f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% of episodes at NFE 9 ({learned[9].chance} "
+            "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
             f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at NFE 9 ({absolute.chance})",
             f"{paper[PAST]} points more with WP-Past, {paper[PREVIEW]} with WP-Preview",
         ],
         "which_source.md": [
-            f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1 on average, perhaps "
-            f"by chance (WP-Past with 25: {past_once.chance})",
+            f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1 on average, which may be "
+            f"due to chance (WP-Past with 25: {past_once.chance})",
             f"WP-Past solves {fifty[0]}%, correlated noise {fifty[1]}%, and the Gaussian source {fifty[2]}%",
             f"WP-Past and WP-Preview score {span(short)} points lower at NFE 1",
             f"the Gaussian source then solves {transport[2]}% at NFE 1 (up from {transport[0]}%), "
@@ -131,13 +147,13 @@ def sentences() -> dict[str, list[str]]:
             f"or {span(fewer_l1)}% with an L1 loss",
         ],
         "leaderboard.md": [
-            f"the decoder of a CVAE solves {rates[CVAE, 9]}% at NFE 9 and the Gaussian source "
+            f"the decoder of a CVAE solves {rates[CVAE, 9]}% of episodes at NFE 9 and the Gaussian source "
             f"{rates[GAUSSIAN, 9]}%. WP-Past solves {rates[PAST, 9]}%, and MIP {rates['mip', 2]}% at NFE 2",
             f"WP-Past solves {past.gain:.0f} points more at NFE 9 ({past.in_trainings}, {past.chance})",
             f"WP-Preview solves fewer at NFE 1 ({preview_once.in_trainings}, {preview_once.chance})",
             f"With each source at its best noise it leads at NFE 3 and 1 ({at_best[3].chance} each), "
             f"but not clearly at NFE 9 ({at_best[9].chance})",
-            f"may be chance at NFE 9 ({learned_mip[9].chance}) and NFE 1 ({learned_mip[1].chance})",
+            f"may be due to chance at NFE 9 ({learned_mip[9].chance}) and NFE 1 ({learned_mip[1].chance})",
         ],
         "results.md": [
             f"With 25, WP-Past is {past_once.gain:.0f} points ahead ({past_once.in_trainings}, "
