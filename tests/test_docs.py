@@ -150,6 +150,29 @@ def test_tables_and_pictures_of_pages_are_those_of_the_stored_rows(monkeypatch):
         assert [sentence for sentence in sentences if sentence not in words] == [], page
 
 
+def _cells(table: str) -> list[list[str]]:
+    """The cells of the lines of a Markdown table, without its head."""
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table.splitlines()[2:]]
+
+
+def test_every_case_of_the_readme_has_its_rows(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "figures")
+    results, leaderboard, shared = map(importlib.import_module, ("results", "leaderboard", "shared"))
+    cases, backed = (
+        _cells(re.search(rf"^\| {head} \|.*?(?=^$|\Z)", page.read_text(), re.M | re.S)[0])
+        for head, page in (("your case", DOCS.parent / "README.md"), ("the README's case", results.PAGE))
+    )
+    assert [case for case, *_ in cases] == [case for case, *_ in backed]
+    names = {name for _, rows, _ in backed for name in re.findall(r"`([\w./]+)`", rows)}
+    files = {name for name in names if "/" in name}
+    assert [name for name in files if not (DOCS.parent / name).is_file()] == []
+    assert names - files <= {path.stem for path in shared.DATA.iterdir()}
+    by_length = {run for runs in results.LENGTHS.values() for run in runs}
+    few = {*results.GROUPS[results.TEN], *results.GROUPS[results.TWENTY_FIVE]}
+    human = {runs[0] for _, runs in leaderboard.HUMAN.values()}
+    assert by_length | few | human <= names
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
     pytest.importorskip("sphinx")
