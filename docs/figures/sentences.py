@@ -143,7 +143,7 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Past and WP-Preview score {span(short)} points lower at NFE 1",
             f"the Gaussian source then solves {transport[2]}% at NFE 1 (up from {transport[0]}%), "
             f"and WP-Past {transport[3]}% (up from {transport[1]}%)",
-            f"NFE 1 solves {span(fewer)}% fewer episodes than NFE 9 on average (leaderboard), "
+            f"at NFE 1 policies solve {span(fewer)}% fewer episodes than at NFE 9 on average (leaderboard), "
             f"or {span(fewer_l1)}% with an L1 loss",
         ],
         "leaderboard.md": [
