@@ -3,8 +3,8 @@
 =====================================
 
 A flow-matching policy turns a random sample into a chunk of actions. Usually that sample is plain
-Gaussian noise, drawn anew at every decision. This tutorial trains two policies that differ only in
-that sample's distribution, the *source*: once :class:`~warmprior.GaussianPrior`, once
+Gaussian noise, drawn again at every decision. This tutorial trains two policies that differ only in
+that sample's distribution, the *source*: one uses :class:`~warmprior.GaussianPrior`, the other
 :class:`~warmprior.PastPrior`, which draws around what the agent has just done. The task is small
 enough to see everything that happens.
 """
@@ -47,8 +47,8 @@ torch.manual_seed(0)
 # The task
 # --------
 # An agent moves from left to right, one position per control step, 64 steps per episode. Its action
-# is its height. Two obstacles stand in the way. Of six demonstrations three pass above both, three
-# below both. So at *every* position there are two good actions, and which one is right depends on
+# is its height. Two obstacles stand in the way. Of six demonstrations, three pass above both and
+# three below both. So at *every* position there are two good actions, and which one is right depends on
 # what the agent did before.
 
 
@@ -83,7 +83,7 @@ plt.show()
 
 # %%
 # ``demos`` is a plain TensorDict of contiguous steps: the observation (the position with its sines
-# and cosines), the action, and the number of the episode. That is all that any data set needs.
+# and cosines), the action, and the number of the episode. That is all that any dataset needs.
 #
 # Training
 # --------
@@ -98,7 +98,7 @@ plt.show()
 #   evaluations.
 # * :class:`~warmprior.FlowMatchingLoss` is a TorchRL loss module.
 #
-# Between the two policies nothing changes but the prior.
+# The prior is the only difference between the two policies.
 
 
 def train(prior, iterations=1000):
@@ -178,11 +178,11 @@ axes[0].set_ylabel("height (executed action)")
 plt.show()
 
 # %%
-# One episode of each is drawn in black, with a dot at every decision. What to notice: nearly each
-# *chunk* of the Gaussian policy is good, and follows a demonstration. But every decision draws its
-# noise anew, and with it the side. With the past in its source, the second decision starts where
+# One episode of each is drawn in black, with a dot at every decision. What to notice: nearly every
+# *chunk* of the Gaussian policy is good, and follows a demonstration. But every decision draws new
+# noise, and with it a new side. With the past in its source, the second decision starts where
 # the first one led, and the agent stays on its side. The network has never seen a history as input:
-# only the place has changed where its flow starts.
+# only the starting point of its flow has changed.
 #
 # The flow
 # --------
@@ -225,8 +225,8 @@ plt.show()
 #
 # Keeping a policy
 # ----------------
-# A saved policy is a folder with a readable configuration and a file of weights. It brings its
-# prior along, and returns the same chunks bit by bit.
+# A saved policy is a folder with a readable configuration and a file of weights. It includes its
+# prior, and returns the same chunks bit for bit.
 
 with tempfile.TemporaryDirectory() as folder:
     save_policy(actors["WP-Past"], folder)

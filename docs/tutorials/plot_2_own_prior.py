@@ -2,7 +2,7 @@
 2. Your own prior, up to a comparison
 =====================================
 
-A prior answers one question: where does the flow of a chunk start, after what the robot did? This
+A prior answers one question: where does the flow of a chunk start, given what the robot has done? This
 tutorial writes one in a few lines, looks at what it does, and compares it with the library's own.
 """
 
@@ -36,7 +36,7 @@ torch.manual_seed(0)
 # --------
 # :class:`~warmprior.PastPrior` starts from the last ``H`` actions as they were. Where actions
 # follow a smooth curve, that lags behind: the next four will be higher if the last four rose. So
-# take the last action, and go on with the last change.
+# take the last action, and continue with the last change.
 
 
 class Momentum(Prior):
@@ -63,7 +63,7 @@ class Momentum(Prior):
 #
 # Look before training
 # --------------------
-# You can look at a mean without any policy. The nearer it is to the next actions, the shorter are
+# You can look at a mean without any policy. The closer it is to the next actions, the shorter
 # the paths of the flow.
 
 demos = navigation_demonstrations()
@@ -106,14 +106,14 @@ axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 plt.show()
 
 # %%
-# What to notice: the past arrives four steps late, the line arrives in time and overshoots where
+# What to notice: the past arrives four steps late; the line arrives on time and overshoots where
 # the curve turns. The distance alone does not say which one makes the better policy: that takes a
 # comparison.
 #
 # A comparison
 # ------------
 # :func:`~warmprior.training.train_policy` takes a task, a source and a recipe. The three policies here
-# differ in their source alone. Network and recipe are those of ``benchmarks/navigation1d.py``, made
+# differ only in their source. Network and recipe are those of ``benchmarks/navigation1d.py``, made
 # smaller.
 
 folder = tempfile.TemporaryDirectory()
@@ -192,12 +192,12 @@ plt.show()
 
 # %%
 # The Gaussian policy runs through the middle, the mean of both sides: a collision in every episode.
-# From the warm sources those episodes collide that begin in the middle, at a first decision without
-# a past, and take too long to leave it.
+# From the warm sources, the episodes that collide are those that begin in the middle, at a first
+# decision without a past, and take too long to leave it.
 #
 # From the command line
 # ---------------------
-# Every benchmark takes a prior of your own by its place, without other code:
+# Every benchmark accepts a prior of your own by its import path, without other code:
 #
 # .. code-block:: console
 #
@@ -206,7 +206,7 @@ plt.show()
 #
 # The first one has the full recipe: a network of twice the width, 3,000 iterations, three minutes of
 # one core. In a run of one training seed neither warm source collided at NFE 9, and at NFE 1 the
-# order of the two turned around. So neither order means anything yet: ``--seeds 5`` gives means and
+# order of the two was reversed. So neither order means anything yet: ``--seeds 5`` gives means and
 # deviations over seeds.
 
 folder.cleanup()

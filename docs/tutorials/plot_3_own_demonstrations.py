@@ -46,9 +46,9 @@ root = Path(folder.name)
 # Recording
 # ---------
 # Here the demonstrator is a controller: it pumps energy into the pendulum until there is enough,
-# and balances it at the top. With you at a joystick the loop is the same. The motor gets its torque
-# with noise, and the file gets what the demonstrator wanted: demonstrations without mistakes do not
-# show how to recover from one.
+# and balances it at the top. With you at a joystick, the loop would be the same. The motor receives
+# the torque with noise, and the file records what the demonstrator intended: demonstrations without
+# mistakes do not show how to recover from one.
 
 
 def demonstrator(observation):
@@ -146,7 +146,7 @@ for key in ("observation", "action", "episode"):
 # --------
 # Networks see values between -1 and 1: the :class:`~warmprior.Normalizer` takes the range from the
 # data, and travels with the policy. :class:`~warmprior.training.BehaviourCloning` is the training
-# loop of the benchmarks: averaged weights, a learning-rate schedule, checkpoints, and it continues
+# loop of the benchmarks: averaged weights, a learning-rate schedule and checkpoints. It continues
 # where it was interrupted.
 
 normalizer = Normalizer.fit(demos)
@@ -180,9 +180,9 @@ policies = {
 # %%
 # Evaluating
 # ----------
-# :func:`~warmprior.evaluation.evaluate` plays the episodes of given seeds, the same ones for every
+# :func:`~warmprior.evaluation.evaluate` runs the episodes of given seeds, the same ones for every
 # policy. It needs one entry that Gymnasium's pendulum lacks: ``"success"``. A small transform adds
-# it: the pendulum stands when the time is over. It also keeps the observations, for the video below;
+# it: whether the pendulum stands when the time is up. It also keeps the observations, for the video below;
 # transforms before :func:`~warmprior.policy_transforms` see every
 # control step.
 
@@ -256,7 +256,7 @@ plt.show()
 # What to notice: from both sources the policies swing up with growing energy, as the demonstrator
 # does. The Gaussian one then holds the pendulum, the other one often goes over the top and needs
 # another turn. Here the observation determines the next action, and the past only misleads the
-# policy to go on as before. A warm source helps in the other case, where one observation leaves
+# policy into continuing as before. A warm source helps in the other case, where one observation leaves
 # several actions open, as in :doc:`tutorial 1 <plot_1_first_policy>`. (How many of 20 episodes end
 # upright differs by several by chance alone: for a comparison take more of them, and several
 # training seeds.)

@@ -98,7 +98,7 @@ colors = dict(zip(actors, ("#7f7f7f", "#1f77b4", "#d95f02"), strict=True))
 # Success against steps
 # ---------------------
 # ``nfe`` is the number of network evaluations per chunk. It is an option of acting, not of
-# training: the same three policies are played with more and fewer.
+# training: the same three policies are evaluated with more and fewer.
 
 
 def collision_rate(actor, nfe):
@@ -132,7 +132,7 @@ plt.show()
 
 # %%
 # What to notice: warm sources need two or three evaluations, and many do not help the Gaussian one:
-# it chooses a side anew at every decision. More steps draw a better sample of the demonstrations,
+# it chooses a side again at every decision. More steps draw a better sample of the demonstrations,
 # and here such samples contradict each other.
 #
 # Why one step is different
@@ -176,7 +176,7 @@ plt.show()
 # ------------
 # :func:`~warmprior.diagnostics.curvature` integrates how far the velocity strays from its mean
 # along each path: 0 is a straight line, which a single Euler step follows exactly. Two numbers
-# belong together. ``kappa`` shrinks with the length of the way, so that a source near the data
+# belong together. ``kappa`` shrinks with the length of the path, so that a source near the data
 # looks straight in any case; ``relative`` divides that out. And ``one_step_error`` is what counts
 # in the end: how far the end of one step is from the end of the path.
 
@@ -204,7 +204,7 @@ plt.show()
 
 # %%
 # What to notice: by ``kappa`` both warm sources are straight. By the ratio WP-Preview is not: its
-# way is so short that bends count for much in it, and for little in the action. Read the two
+# path is so short that bends count for a lot in this ratio, and for little in the action. Read the two
 # together, and trust the error. (``shared.met`` makes the history that a *running* policy meets, with
 # its own previous prediction; ``shared.windows`` the one of the training.)
 #

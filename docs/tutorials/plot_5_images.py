@@ -2,8 +2,8 @@
 5. Policies that see images
 ===========================
 
-With cameras nothing changes but the observation: a vector next to images, nested under one key, and
-an encoder in front of the network. The task of this tutorial draws its own pictures, so that it
+With cameras only the observation changes: a vector next to images, nested under one key. An encoder
+in front of the network reads it. The task of this tutorial draws its own pictures, so that it
 runs without a simulator: a gripper, seen from above, has to reach a part whose position only the
 camera shows.
 """
@@ -109,8 +109,8 @@ class ReachEnv(EnvBase):
 # %%
 # Demonstrations
 # --------------
-# The demonstrator knows where the part is, and goes there. What is stored are contiguous steps as
-# in every data set; the images stay bytes. (Large files keep them on disk: ``storage="memmap"`` of
+# The demonstrator knows where the part is, and goes there. The dataset holds contiguous steps, as
+# always; the images stay bytes. (Large files keep them on disk: ``storage="memmap"`` of
 # the readers.)
 
 
@@ -138,9 +138,9 @@ plt.show()
 # -----------
 # :class:`~warmprior.ImageEncoder` has one small network per camera (``backbone="resnet18"`` is the
 # paper's) and puts the features behind the vector. In training it cuts out a random window of
-# ``crop_size`` pixels, in evaluation the middle one, so that the policy does not learn pixels by
-# heart. :class:`~warmprior.VisionNetwork` puts it in front of any velocity network, and runs it
-# once per decision, however many integration steps follow. The rest is as without images.
+# ``crop_size`` pixels, in evaluation the middle one, so that the policy does not memorise
+# pixels. :class:`~warmprior.VisionNetwork` puts it in front of any velocity network, and runs it
+# once per decision, however many integration steps follow. Everything else is the same as without images.
 
 
 def train(demos, iterations=700):
@@ -192,8 +192,8 @@ blind, blind_losses = train(blank, iterations=300)
 # ``blind`` is the same policy trained on blank images. Train one whenever you train a policy on
 # images: if it solves the task as well, the images are not what your policy uses.
 #
-# Playing
-# -------
+# Acting
+# ------
 
 
 def play(actor, camera=True):
@@ -250,8 +250,8 @@ plt.show()
 # %%
 # Each star is a part, in the color of the path to it; a dot is a decision, of four actions each.
 # What to notice: with images the paths lead to their parts, and their slight overshoot is that of
-# four actions decided at once. The blind policy has only learnt what all demonstrations share, to
-# go up.
+# four actions decided at once. The blind policy has only learned what all demonstrations have in
+# common: to go up.
 #
 # Robots
 # ------

@@ -2,7 +2,7 @@
 6. Reinforcement learning in source space
 =========================================
 
-A cloned policy does what was demonstrated, and not always what is wanted. It can be improved
+A cloned policy does what was demonstrated, which is not always what is wanted. It can be improved
 without touching its weights: the policy stays frozen, and a small agent chooses where its flow
 *starts*. From a Gaussian source that is `DSRL <https://arxiv.org/abs/2506.15799>`_; from a warm
 source the agent searches in a small box around what the robot was doing. This tutorial does both,
@@ -93,8 +93,8 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 # the wrong side. An agent needs one more transform than usual:
 # :class:`~warmprior.PriorAnchor` writes the point around which the agent acts.
 #
-# :func:`~warmprior.evaluation.evaluate` plays the same episodes with any policy, frozen ones and
-# agents alike.
+# :func:`~warmprior.evaluation.evaluate` runs the same episodes with any policy, frozen policies
+# and agents alike.
 
 
 def make_env(actor, seed):  # of the simulator; nothing in this one is random
@@ -135,8 +135,8 @@ plt.show()
 
 # %%
 # What to notice: WP-Past keeps the side on which it began, so that a third of its episodes
-# happen to take the right one. The Gaussian policy would have to choose it anew at every decision,
-# and hardly ever does.
+# happen to take the right one. The Gaussian policy would have to choose that side again at every
+# decision, and hardly ever does.
 #
 # What an agent can do
 # --------------------
@@ -207,7 +207,7 @@ plt.show()
 # Training the agents
 # -------------------
 # :class:`~warmprior.PriorSpaceTraining` collects, learns with DSRL-NA
-# (:class:`~warmprior.DSRLNALoss`), evaluates, and saves, so that the same line goes on after an
+# (:class:`~warmprior.DSRLNALoss`), evaluates, and saves, so that the same line continues after an
 # interruption. The box is 0.5 around a mean and 1.5 around zero by default. The first 2,000 control
 # steps are collected without an agent, by residuals from the prior.
 #
@@ -271,15 +271,15 @@ axes[0].legend(loc="upper left")
 plt.show()
 
 # %%
-# What to notice: grey is the time in which the agents do not learn. What they do then differs from the
-# frozen policy, for their first residuals take the place of its noise. Nothing much changes
+# What to notice: grey marks the time in which the agents do not learn. What they do then differs from the
+# frozen policy, because their first residuals take the place of its noise. Nothing much changes
 # until enough of what they collected shows where the reward is, and then they solve
-# every episode. They begin from very different levels. The frozen WP-Past earns a reward in a
+# every episode. They start from very different levels. The frozen WP-Past earns a reward in a
 # third of its episodes, the Gaussian policy in one of twenty, so that the second agent has to find its
 # few successes first.
 #
-# Playing
-# -------
+# Acting
+# ------
 # ``training.agent.policy`` is the agent followed by the decoder, a policy for any rollout or
 # collector. Greedy is what TorchRL calls the deterministic exploration type.
 
@@ -298,8 +298,8 @@ folder.cleanup()
 # decoder, and all episodes are the same one. Around WP-Past the first anchor is a draw, and the
 # agent brings all of them to the upper side by its second decision.
 #
-# In earnest
-# ----------
+# At full scale
+# -------------
 # This was one seed of each. The benchmark has the same toy with larger networks, 12,000 control
 # steps and three seeds: ``benchmarks/prior_space_rl.py --preset unit --prior gaussian past --centre mean``.
 # :doc:`The lab notes </notes/evidence>` have the results. With chunks of eight both agents

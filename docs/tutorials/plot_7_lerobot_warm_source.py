@@ -4,9 +4,9 @@
 
 LeRobot's flow policies start every chunk from Gaussian noise. Here one of them gets a warm source:
 the policy stays LeRobot's own class with its own weights, loss and sampler, and only the noise that
-these would draw is replaced. It is first trained as LeRobot does, then played and fine-tuned from
-WP-Past. The policy is tiny and the task that of :doc:`tutorial 1 <plot_1_first_policy>`, so that it
-runs here; the commands for large ones stand at the end.
+these would draw is replaced. It is first trained as in LeRobot, then evaluated and fine-tuned from
+WP-Past. The policy is tiny, and the task is that of :doc:`tutorial 1 <plot_1_first_policy>`, so that it
+runs here; the commands for large policies are at the end.
 """
 
 import copy
@@ -84,7 +84,7 @@ dataset = LeRobotDataset(
     },
 )
 
-# All windows at once; a real data set is read by a DataLoader.
+# All windows at once; a real dataset is read by a DataLoader.
 windows = default_collate([dataset[i] for i in range(len(dataset))])
 windows["action"] = windows["action"].unsqueeze(-1)
 windows = {
@@ -100,8 +100,8 @@ print({key: tuple(value.shape) for key, value in windows.items()})
 #
 # The policy
 # ----------
-# ``multi_task_dit`` is LeRobot's diffusion transformer, here with flow matching. It reads its
-# instruction by CLIP's text encoder from the hub; ours is tiny, with random weights, and the
+# ``multi_task_dit`` is LeRobot's diffusion transformer, here with flow matching. It encodes its
+# instruction with CLIP's text encoder from the hub; ours is tiny, with random weights, and the
 # instruction is always the same two tokens. Heights lie in [-1, 1] already, so the processors that
 # tokenise and normalise are left out.
 
@@ -251,8 +251,8 @@ plt.show()
 # them lie on its side already (except those whose past was hidden), so the paths of the flow are
 # shorter.
 #
-# Playing
-# -------
+# Acting
+# ------
 # On a robot that is LeRobot's own loop around ``adapter.select_action``, which returns one action
 # after another and predicts a new chunk whenever the last one is used up:
 
@@ -318,14 +318,14 @@ plt.show()
 folder.cleanup()
 
 # %%
-# What to notice, from left to right: LeRobot's policy draws anew which side to pass on, at every
+# What to notice, from left to right: LeRobot's policy draws a new side to pass on at every
 # decision. With the same weights and a warm source it stays on its side, before any fine-tuning:
 # this flow happens to carry what starts above to actions above. Do not count on it; for these
 # weights the source is one that they have never seen, and a toy with one action dimension is kind.
 # Fine-tuning adds nothing to that at nine evaluations; a few episodes more collide. It shows below,
 # at a single evaluation, where a policy returns the mean of what its source
 # leaves open: the unchanged weights run through the middle whatever the source, and the
-# fine-tuned ones have begun to leave it. Most episodes still collide, for they begin there, at a
+# fine-tuned ones have begun to leave it. Most episodes still collide, because they begin there, at a
 # first decision without a past, and 400 iterations are few.
 #
 # Large policies

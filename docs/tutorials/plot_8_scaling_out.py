@@ -24,7 +24,7 @@ torch.manual_seed(0)
 # %%
 # A grid, side by side
 # --------------------
-# Every benchmark trains and plays in worker processes, as many as ``--envs`` says (one per core by
+# Every benchmark trains and evaluates in worker processes, as many as ``--envs`` says (one per core by
 # default). A worker takes one job after another and computes with one thread. Here are the toy's
 # policies from two sources, with a small network and two seeds. The script is found from the folder of this
 # tutorial, ``docs/tutorials`` of a checkout: start it there.
@@ -51,7 +51,7 @@ for row in rows:
 # %%
 # Nothing is trained twice
 # ------------------------
-# A policy lies in a folder named by everything that determines it, in ``policies/`` next to the
+# A policy is in a folder named after everything that determines it, in ``policies/`` next to the
 # runs. A run with a third seed finds the other four policies there, and trains two.
 
 policies = Path(folder.name) / "grid" / "policies"
@@ -63,8 +63,8 @@ for path in sorted(policies.glob("*/state*")):
     print(path.parent.name, "as it was" if kept else "new")
 
 # %%
-# It is the same after an interruption: ``--resume`` continues a training from its last saved state,
-# and plays the rows that are missing.
+# It is the same after an interruption: ``--resume`` continues a training run from its last saved
+# state, and evaluates the missing rows.
 #
 # Nothing depends on who computes
 # -------------------------------
@@ -101,8 +101,8 @@ folder.cleanup()
 # %%
 # How far that goes
 # -----------------
-# With two cores WP-Past on square played 1.87 times as many episodes per minute as with one, and trainings
-# side by side took 1.96 times as many steps (:doc:`/scaling`).
+# With two cores WP-Past on square played 1.87 times as many episodes per minute as with one, and training
+# runs side by side took 1.96 times as many steps (:doc:`/scaling`).
 #
 # More machines
 # -------------
@@ -116,7 +116,7 @@ folder.cleanup()
 #    python benchmarks/robomimic.py --engine ray --ray-address HEAD:6379 --out /shared/runs/square
 #
 # ``--out`` is a folder that all machines see at the same path. If a machine is lost, Ray starts its
-# jobs again elsewhere, and a training continues from its last state. If the driver is lost, resume
+# jobs again elsewhere, and a training run continues from its last state. If the driver is lost, resume
 # the run, with Ray or without:
 #
 # .. code-block:: console
@@ -125,7 +125,7 @@ folder.cleanup()
 #
 # One large network
 # -----------------
-# If a single training takes too long, several processes share its batches. Each draws a part of
+# If a single training run takes too long, several processes share its batches. Each draws a part of
 # every batch, so the weights depend on their number:
 #
 # .. code-block:: console
