@@ -1,4 +1,7 @@
-"""Options of the source, and its defaults."""
+"""Options of the source, and its defaults.
+
+``train --prior`` knows the priors that ``warmprior/modules/__init__.py`` imports by their ``name``.
+"""
 
 from __future__ import annotations
 
