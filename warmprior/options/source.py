@@ -1,6 +1,6 @@
 """Options of the source, and its defaults.
 
-``train --prior`` knows the priors that ``warmprior/modules/__init__.py`` imports by their ``name``.
+A source is named by the ``name`` of a prior that ``warmprior/modules/__init__.py`` imports.
 """
 
 from __future__ import annotations
