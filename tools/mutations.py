@@ -4,7 +4,7 @@ python tools/mutations.py              # all, in a copy of the last commit; some
 python tools/mutations.py 3 7          # the third and the seventh
 
 A fault is a line of the library and what replaces it, with the test files that must fail. Files are found by
-the line, and tests by their names, so that rooms may move.
+the line, and tests by their names, so that rooms may move. Without a fault all of these tests must pass.
 """
 
 from __future__ import annotations
@@ -67,22 +67,31 @@ def sources(root: Path, line: str) -> list[Path]:
     return [path for path in root.glob("warmprior/**/*.py") if line in path.read_text(encoding="utf-8")]
 
 
+def tests_of(root: Path, names: str) -> list[str]:
+    """Return the test files with these names."""
+    return sorted({str(path) for name in names.split() for path in root.glob(f"tests/**/test_{name}.py")})
+
+
+def outcome(root: Path, tests: list[str]) -> int:
+    """Return pytest's exit code for test files: 0 if they pass, 1 if a test fails."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    places = [str(root / part) for part in ("", "benchmarks", "plugins/lerobot_policy_warmprior")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=root, env=environment, capture_output=True).returncode
+
+
 def is_caught(root: Path, line: str, replacement: str, names: str) -> bool:
     """Return True if a test fails with the fault; raise ValueError if the line is not there once."""
     found = sources(root, line)
     if len(found) != 1:
         raise ValueError(f"{line!r} is in {len(found)} files: name a line that is in one")
     before = found[0].read_text(encoding="utf-8")
-    tests = [str(path) for name in names.split() for path in root.glob(f"tests/**/test_{name}.py")]
+    tests = tests_of(root, names)
     if before.count(line) != 1 or not tests:
         raise ValueError(f"{line!r} is {before.count(line)} times in {found[0]}; its tests are {tests}")
     found[0].write_text(before.replace(line, replacement), encoding="utf-8")
     try:
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
-        places = [str(root / part) for part in ("", "benchmarks", "plugins/lerobot_policy_warmprior")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(command, cwd=root, env=environment, capture_output=True)
-        return done.returncode == 1  # any other code is no failed test
+        return outcome(root, tests) == 1  # any other code is no failed test
     finally:
         found[0].write_text(before, encoding="utf-8")
 
@@ -94,6 +103,9 @@ def main(chosen: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True)
         subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
+        names = " ".join(FAULTS[number][2] for number in numbers)
+        if code := outcome(Path(folder), tests_of(Path(folder), names)):
+            raise RuntimeError(f"without a fault the tests end with code {code}: mend them first")
         for number in numbers:
             caught = is_caught(Path(folder), *FAULTS[number])
             missed += not caught

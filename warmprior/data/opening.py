@@ -20,7 +20,10 @@ FORMATS: tuple[type[Demonstrations], ...] = (
     RobomimicFolder,
     RobomimicDemonstrations,
 )
-"""The formats; the first whose ``reads`` accepts a place opens it."""
+"""The formats; the first whose ``reads`` accepts a place opens it.
+
+Help says what places they have: ``PLACES`` in ``warmprior/options/data.py``.
+"""
 
 
 def open_demonstrations(

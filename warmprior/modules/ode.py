@@ -24,6 +24,7 @@ from warmprior.checks import (
 )
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity
+from warmprior.options.evaluation import DEFAULT_NFE
 
 JUMP = 0.5
 """The end of the dense steps of ``dense-jump``; Chen et al. saw fields pull to training actions after it."""
@@ -70,9 +71,6 @@ def _jump(grid: str) -> float | None:
         raise ValueError(f"the jump of a grid must start in (0, 1), got {grid!r}")
     return share
 
-
-DEFAULT_NFE = 3
-"""The default number of network evaluations per chunk; docs/which_source.md has the reasons."""
 
 MAX_NFE = 10_000
 """The largest ``nfe``: more would take minutes per chunk, and look like a process that hangs."""

@@ -1,5 +1,8 @@
 """Options of evaluations."""
 
+DEFAULT_NFE = 3
+"""The default number of network evaluations per chunk; docs/which_source.md has the reasons."""
+
 EVALUATION_SEED = 10_000_000
 """Simulator seed of the first evaluation episode.
 

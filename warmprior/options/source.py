@@ -1,4 +1,7 @@
-"""Options of the source, and its defaults."""
+"""Options of the source, and its defaults.
+
+A source is named by the ``name`` of a prior that ``warmprior/modules/__init__.py`` imports.
+"""
 
 from __future__ import annotations
 

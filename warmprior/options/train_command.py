@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warmprior.options.data import Actions, Resizing
+from warmprior.options.evaluation import DEFAULT_NFE
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,17 @@ class Evaluation:
     """The options of the evaluation.
 
     Attributes:
-        nfe: network evaluations per chunk, saved with the policy; by default 3, or 1 if times is start
+        nfe: network evaluations per chunk, saved with the policy; by default {DEFAULT_NFE},
+            or 1 if times is start
         held_out: number of last demonstrations to leave out for measuring the error of actions; by default
             a tenth, or one of few, if no environment is known, else none
     """
 
     nfe: int | None = None
     held_out: int | None = None
+
+
+Evaluation.__doc__ = str(Evaluation.__doc__).format(DEFAULT_NFE=DEFAULT_NFE)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from warmprior.checks import (
 )
 
 Network = Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"]
+"""The library's networks; ``warmprior/training/networks.py`` has their classes."""
 
 TRANSFORMERS = ("chi_transformer", "adaln_transformer")
 

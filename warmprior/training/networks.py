@@ -26,6 +26,7 @@ _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "chi_transformer": (ChiTransformer, "embedding_dim"),
     "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
 }
+"""The class and the option of width of every ``Network``, a name in ``warmprior/options/training.py``."""
 
 
 def own_network(options: NetworkOptions) -> type[VelocityNetwork] | None:

@@ -1,7 +1,8 @@
 """The columns of rows and tables: meaning and number format of each, defined once.
 
 Rows are those of `results.jsonl` and `curvature.jsonl`; tables have means over training seeds. A report ends
-with the meanings of its columns.
+with the meanings of its columns. Their values come from `row` (`running/policies.py`), `measure`
+(`running/measuring.py`) and, over several rows, `summary` (`report.py`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The figures of the benchmarks: bars, lines, violins and paths, from the same rows as the tables."""
+"""The figures of the benchmarks: bars, lines, violins and paths, from the same rows as the tables.
+
+`running/pictures.py` says which a comparison gets; scripts draw others themselves.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Rows of results, written, and checked when they are read.
 
 A row is one JSON object in a file of lines. Its columns are defined in `columns.py`; their formats say their
-types.
+types. `compare` (`running/comparison.py`) writes a row once its episodes are played.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REQUIRED = ("sigma", *COUNTED)
 METHOD = ("task", "data", "prior", "options", "sigma", "chunk", "seed", "nfe")
 
 PLAYED = (*METHOD, "temperature", "policy", "iterations", "checkpoint", *COUNTED, "outcomes")
-"""A row of a policy has these columns: `policies.row` writes them."""
+"""A row of a policy has these columns: `policies.row` makes them."""
 
 AGENT = (*METHOD, "algorithm", "centre", "delta", "evaluation", "environment_steps", *COUNTED)
 """A row of an agent's evaluation has these columns."""
@@ -101,7 +101,7 @@ def _check(row: Mapping[str, Any], needed: Iterable[str], whose: str) -> None:
         try:
             form = column(name).form
         except KeyError:
-            raise ValueError(f"it has an unknown column {name!r}") from None
+            raise ValueError(f"it has a column {name!r} that columns.py does not define") from None
         # Null stands for a measure that could not be taken, and for the seed of a mean over several.
         null = "mean" in row if name == "seed" else form not in ("", "d") and name not in REQUIRED
         if not (_fits(value, form) or (null and value is None)):

@@ -17,10 +17,10 @@ from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
 from warmprior import Prior
 from warmprior.checks import check_between, check_choice
 from warmprior.lerobot import history_indices
-from warmprior.modules.ode import DEFAULT_NFE
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
+from warmprior.options.evaluation import DEFAULT_NFE
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build

@@ -1,4 +1,4 @@
-"""Seeds of the episodes that the rows of a batched environment play."""
+"""Seeds of the simulators in a batched environment; `episodes.py` seeds the noise of policies."""
 
 from __future__ import annotations
 
