@@ -16,7 +16,7 @@ QUESTIONS = (
     ("Can the same observation call for\ndifferent actions (several routes)?", "PastPrior(8), nfe=3", BLUE),
     ("Do you set joints=, or are actions\nabsolute poses of an arm?", "GaussianPrior(8), nfe=3", GREY),
     ("Human demonstrations, without\ncameras?", "CVAEPrior(8), nfe=9", LEARNED),
-    ("At most 25 scripted demos, and time\nfor NFE 1 only?", "PastPrior(8), nfe=1", BLUE),
+    ("At most 25 scripted demos, and\nonly time for NFE 1?", "PastPrior(8), nfe=1", BLUE),
 )
 
 
