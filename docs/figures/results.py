@@ -30,6 +30,7 @@ from shared import (
     figure,
     finish,
     lines,
+    read_arms,
     read_cells,
     read_played,
     save,
@@ -57,6 +58,7 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),
 }
 WARM = (PAST, PREVIEW, CORRELATED)
+AGENTS = "agents_lift"
 
 
 def gains() -> DataFrame:
@@ -127,6 +129,24 @@ def iterations() -> None:
         finish(axis, name.replace(", ", ",\n"), xlabel="thousand iterations of batch 128", xlim=(8, 100))
     picture.supylabel("success in percent, mean of NFE 9, 3 and 1, 95% interval", fontsize=10)
     save(picture, "iterations")
+
+
+def agents() -> None:
+    """Draw chart D: success of agents in source space, the mean over seeds and every seed."""
+    rows = read_arms(AGENTS).query("centre != 'zero'")
+    picture, (axis,) = figure(WIDTH, 4.4, 1, "Agents in the source space of weak policies on lift")
+    for arm, part in rows.groupby("arm", sort=False):
+        _, color, _ = SOURCES[part["prior"].iloc[0]]
+        style, mark = ("--", "s") if part["algorithm"].iloc[0] == "dsrl-sac" else ("-", "o")
+        for _, curve in part.groupby("seed"):
+            rates = 100 * curve["success_rate"]
+            axis.plot(curve["environment_steps"], rates, style, color=color, lw=0.7, alpha=0.4)
+        mean = part.groupby("evaluated")[["environment_steps", "success_rate"]].mean()
+        rates = 100 * mean["success_rate"]
+        axis.plot(mean["environment_steps"], rates, style, color=color, lw=2, marker=mark, ms=5, label=arm)
+    finish(axis, "greedy agents, NFE 1; thin lines are seeds", xlabel="control steps", ylim=(-3, 103))
+    axis.set_ylabel("success in percent")
+    save(picture, "agents")
 
 
 def table() -> str:
@@ -230,6 +250,6 @@ def tables() -> dict[Path, list[str]]:
 
 if __name__ == "__main__":
     OUT.mkdir(parents=True, exist_ok=True)
-    for draw in one_step, steps, iterations:
+    for draw in one_step, steps, iterations, agents:
         draw()
     write(tables())

@@ -84,6 +84,18 @@ def read_cells(names: Iterable[str], common_seeds: bool = False) -> DataFrame:
     return cells.assign(success=[100 * solved.mean() for solved in cells["solved"]])
 
 
+@cache
+def read_arms(name: str) -> DataFrame:
+    """Return the rows of a comparison of agents, with the agent in words and the number of the evaluation.
+
+    Evaluation 0 is that of the frozen policy.
+    """
+    rows = read_json(DATA / f"{name}.jsonl", lines=True)
+    around = np.where(rows["centre"] == "zero", ", around zero", "")
+    arm = rows["algorithm"].str.upper() + ", " + rows["prior"].map(lambda prior: SOURCES[prior][0]) + around
+    return rows.assign(arm=arm, evaluated=rows.groupby([arm, "seed"]).cumcount())
+
+
 def at_nine_three_one(rows: DataFrame, source: str) -> str:
     """Return the mean success of a source over cells at NFE 9, 3 and 1, or at the only NFE that it has."""
     rates = rows[rows["source"] == source].groupby("nfe")["success"].mean()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from pandas import DataFrame, read_json
-from shared import DATA, GAUSSIAN, SOURCES, read_played, shown_sources
+from shared import DATA, GAUSSIAN, SOURCES, read_arms, read_played, shown_sources
 
 from lab.measures.statistics import chosen_elsewhere
 
@@ -183,6 +183,23 @@ def agents_table(name: str) -> str:
     return "\n".join(text) + "\n"
 
 
+def arms_table(name: str) -> str:
+    """Return success of a comparison of agents in Markdown, in percent: a line per agent.
+
+    Evaluations of all seeds are averaged in their order; the last is also given by seed.
+    """
+    rows = read_arms(name)
+    steps = rows.groupby("evaluated")["environment_steps"].mean().round(-3)
+    heads = ["agent", "frozen policy", *(f"{int(step):,}" for step in steps[1:]), "the last, by seed"]
+    text = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for arm, part in rows.groupby("arm", sort=False):
+        rates = 100 * part.groupby("evaluated")["success_rate"].mean() + 1e-6
+        last = 100 * part.groupby("seed")["success_rate"].last() + 1e-6
+        cells = [*(f"{rate:.0f}" for rate in rates), ", ".join(f"{rate:.0f}" for rate in last)]
+        text.append(f"| {arm} | {' | '.join(cells)} |")
+    return "\n".join(text) + "\n"
+
+
 KINDS: dict[str, Callable[[str], str]] = {
     "rows": played_table,  # by NFE and noise
     "sigma": partial(study_table, "sigma"),
@@ -193,6 +210,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "curvature": curvature_table,
     "forecasts": forecasts_table,
     "agents": agents_table,
+    "arms": arms_table,
 }
 """The tables of a run by their kind, which a page names before the run: ``<!-- KIND RUN -->``."""
 
