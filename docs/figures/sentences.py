@@ -12,6 +12,7 @@ from comparisons import Comparison
 from leaderboard import SCRIPTED, beside_source, paper_gain, standings
 from pandas import DataFrame
 from results import (
+    AGENTS,
     CHOICES,
     GROUPS,
     LENGTHS,
@@ -24,7 +25,7 @@ from results import (
     all_lengths,
     outcomes_by_length,
 )
-from shared import CORRELATED, CVAE, GAUSSIAN, PAST, PREVIEW, read_cells, read_played
+from shared import CORRELATED, CVAE, GAUSSIAN, PAST, PREVIEW, SOURCES, read_arms, read_cells, read_played
 
 
 def whole(number: float) -> int:
@@ -80,6 +81,12 @@ def beside_gaussian(runs: Iterable[str], source: str) -> str:
     """Return the mean success of a source and the Gaussian source over the tasks of some runs, by NFE."""
     rates = (spaced(mean(runs, name, nfe) for nfe in (9, 3, 1)) for name in (source, GAUSSIAN))
     return " against ".join(f"{each}%" for each in rates)
+
+
+def improved(arm: str) -> str:
+    """Return the mean success of the policies of agents on lift, and of the agents in the end."""
+    rates = read_arms(AGENTS).query("arm == @arm").groupby("evaluated")["success_rate"].mean()
+    return f"{whole(100 * rates.iloc[0])}% to {whole(100 * rates.iloc[-1])}%"
 
 
 def sentences() -> dict[str, list[str]]:
@@ -158,6 +165,10 @@ def sentences() -> dict[str, list[str]]:
         "results.md": [
             f"With 25, WP-Past is {past_once.gain:.0f} points ahead ({past_once.in_trainings}, "
             f"{past_once.chance})",
+        ],
+        "prior_space_rl.md": [
+            f"WP-Past's agent rises from {improved(f'DSRL-NA, {SOURCES[PAST][0]}')}, "
+            f"the Gaussian source's from {improved(f'DSRL-NA, {SOURCES[GAUSSIAN][0]}')}",
         ],
         "faq.md": [
             f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0), and 1 solved more: {whole(noise[1])}%, "
