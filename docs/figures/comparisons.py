@@ -60,7 +60,8 @@ class Comparison:
     @property
     def in_trainings(self) -> str:
         """The trainings ahead and behind in words."""
-        return f"ahead in {self.ahead} of {self.trainings} training runs and behind in {self.behind}"
+        behind = self.behind or "none"
+        return f"ahead in {self.ahead} of {self.trainings} training runs and behind in {behind}"
 
     @property
     def points(self) -> str:

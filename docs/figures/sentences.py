@@ -128,28 +128,29 @@ def sentences() -> dict[str, list[str]]:
         "../README.md": [
             f"{rates[PAST, 9]}% against {rates[GAUSSIAN, 9]}% ({past.in_trainings}, {past.chance})",
             f"The difference at NFE 1, {rates[PAST, 1]}% against {rates[GAUSSIAN, 1]}%, may be due to chance",
-            f"WP-Past and WP-Preview score {span(few)} points more at NFE 1",
+            f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1",
             f"({past_once.in_trainings}, {past_once.chance})",
-            f"{span(short)} points less at NFE 1 after short training",
+            f"{span(short)} points lower at NFE 1 after short training",
             f"with WP-Past**: {long_rates[0]}% against {long_rates[1]}% ({chances(long)})",
             f"clear difference** for WP-Past: {better_rates[0]}% against {better_rates[1]}%",
             f"{default_rates[0]}% against {default_rates[1]}% ({chances(correlated_long)})",
-            f"the four human sets at NFE 9 ({rates[CORRELATED, 9]}% against {rates[GAUSSIAN, 9]}%)",
+            f"the four human datasets at NFE 9 ({rates[CORRELATED, 9]}% against {rates[GAUSSIAN, 9]}%)",
             f"with 25 scripted demonstrations ({scripted[TWENTY_FIVE]})",
             f"with 300 after 80,000 iterations ({scripted[MANY]})",
             f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% of episodes at NFE 9 ({learned[9].chance} "
             "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
             f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at NFE 9 ({absolute.chance})",
-            f"{paper[PAST]} points more with WP-Past, {paper[PREVIEW]} with WP-Preview",
+            f"{paper[PAST]} points higher with WP-Past, and {paper[PREVIEW]} points higher with WP-Preview",
         ],
         "which_source.md": [
             f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1 on average, which may be "
             f"due to chance (WP-Past with 25: {past_once.chance})",
-            f"WP-Past solves {fifty[0]}%, correlated noise {fifty[1]}%, and the Gaussian source {fifty[2]}%",
+            f"WP-Past solves {fifty[0]}% of episodes, correlated noise {fifty[1]}%, "
+            f"and the Gaussian source {fifty[2]}%",
             f"WP-Past and WP-Preview score {span(short)} points lower at NFE 1",
-            f"the Gaussian source then solves {transport[2]}% at NFE 1 (up from {transport[0]}%), "
-            f"and WP-Past {transport[3]}% (up from {transport[1]}%)",
+            f"the Gaussian source then solves {transport[2]}% of episodes at NFE 1 "
+            f"(up from {transport[0]}%), and WP-Past {transport[3]}% (up from {transport[1]}%)",
             f"at NFE 1 policies solve {span(fewer)}% fewer episodes than at NFE 9 on average (leaderboard), "
             f"or {span(fewer_l1)}% with an L1 loss",
         ],
@@ -171,7 +172,7 @@ def sentences() -> dict[str, list[str]]:
             f"the Gaussian source's from {improved(f'DSRL-NA, {SOURCES[GAUSSIAN][0]}')}",
         ],
         "faq.md": [
-            f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0), and 1 solved more: {whole(noise[1])}%, "
-            f"against {whole(noise[0.5])} at 0.5"
+            f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0), "
+            f"and `sigma=1` solved more: {whole(noise[1])}%, against {whole(noise[0.5])}% at 0.5"
         ],
     }
