@@ -43,7 +43,7 @@ from lab.measures.statistics import chosen_elsewhere
 from lab.reporting.paper import PAPER_SUCCESS, STATE
 
 PAGE = DOCS / "results.md"
-TEN, TWENTY_FIVE, MANY = "10", "25", "300 of six operators"
+TEN, TWENTY_FIVE, MANY = "10", "25", "300 from six operators"
 SHORT = "square_mh_10000", "transport_mh_10000"
 LONG = "square_mh_80000", "transport_mh_80000"
 GROUPS = {TEN: ("scripted_10",), TWENTY_FIVE: ("scripted_25",), MANY: LONG}
@@ -51,8 +51,8 @@ GROUPS = {TEN: ("scripted_10",), TWENTY_FIVE: ("scripted_25",), MANY: LONG}
 LENGTHS = {  # demonstrations whose runs differ in the length of training
     f"square, {MANY}": (SHORT[0], LONG[0]),
     f"transport, {MANY}": (SHORT[1], LONG[1]),
-    "can, 25 of six operators": ("can_mh_25_10000", "can_mh_25_80000"),
-    "can, 150 of six operators": ("can_mh_150_10000", "can_mh_150_80000"),
+    "can, 25 from six operators": ("can_mh_25_10000", "can_mh_25_80000"),
+    "can, 150 from six operators": ("can_mh_150_10000", "can_mh_150_80000"),
     "door, 25 human": ("door_20000", "door_80000"),
     "Push-T, 50 human": ("pusht_50", "pusht_50_80000"),
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),

@@ -157,8 +157,8 @@ def sentences() -> dict[str, list[str]]:
         "leaderboard.md": [
             f"the decoder of a CVAE solves {rates[CVAE, 9]}% of episodes at NFE 9 and the Gaussian source "
             f"{rates[GAUSSIAN, 9]}%. WP-Past solves {rates[PAST, 9]}%, and MIP {rates['mip', 2]}% at NFE 2",
-            f"WP-Past solves {past.gain:.0f} points more at NFE 9 ({past.in_trainings}, {past.chance})",
-            f"WP-Preview solves fewer at NFE 1 ({preview_once.in_trainings}, {preview_once.chance})",
+            f"WP-Past scores {past.gain:.0f} points higher at NFE 9 ({past.in_trainings}, {past.chance})",
+            f"WP-Preview solves fewer episodes at NFE 1 ({preview_once.in_trainings}, {preview_once.chance})",
             f"With each source at its best noise it leads at NFE 3 and 1 ({at_best[3].chance} each), "
             f"but not clearly at NFE 9 ({at_best[9].chance})",
             f"may be due to chance at NFE 9 ({learned_mip[9].chance}) and NFE 1 ({learned_mip[1].chance})",
