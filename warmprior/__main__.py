@@ -276,7 +276,7 @@ def improve(
     )
     if result.policy.start is not actor.start:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
-    print(f"{words}\nto play it: {command_of('evaluate', place / 'policy')}")
+    print(f"{words}\nto evaluate it: {command_of('evaluate', place / 'policy')}")
 
 
 def command_of(command: str, folder: Path) -> str:
@@ -386,7 +386,7 @@ def train(
     elif whole.environment is None:
         print("no demonstration is held out, so no error is measured")
     if playable:
-        print(f"to play it: {command_of('evaluate', saved)} --nfe {' '.join(map(str, nfes[::-1]))}")
+        print(f"to evaluate it: {command_of('evaluate', saved)} --nfe {' '.join(map(str, nfes[::-1]))}")
     else:
         print(f"what a robot has to give it: {command_of('info', saved)}; its loop: docs/your_robot.md")
     print(saved)

@@ -258,7 +258,7 @@ def test_an_environment_that_reports_no_success_is_trained_for(tmp_path, capsys)
     small = ["--iterations", "2", "--hidden-dim", "8", "--out", str(tmp_path)]
     assert not main(["train", f"minari:{name}", *small])
     said = capsys.readouterr().out
-    assert "only trained" in said and "to play it" not in said
+    assert "only trained" in said and "to evaluate it" not in said
 
 
 def test_nothing_named_in_a_dataset_is_imported(root):

@@ -1,5 +1,7 @@
 """A policy improved by an agent decodes what the agent's environment decodes, and is a policy like others."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -21,6 +23,7 @@ from warmprior import (
     PriorAnchor,
     PriorDecoder,
     RealTimeChunking,
+    VelocityMLP,
     keys,
     make_prior_space_actor,
     policy_transforms,
@@ -136,6 +139,16 @@ def test_it_is_saved_and_plays_like_any_policy(case, tmp_path):
     assert env.rollout(4, again)[keys.CHUNK].shape[-2:] == (prior.prediction_length, ACTION_DIM)
     with AsyncExecutor(again, latency=1) as executor:
         assert executor.act(torch.zeros(WIDTH)).shape == (ACTION_DIM,)
+
+
+def test_a_process_that_knows_no_agents_loads_it(tmp_path):
+    actor = make_actor().replace(network=VelocityMLP(ACTION_DIM, WIDTH, H, observation_steps=1))
+    save_policy(improved_policy(actor, make_agent(actor), nfe=2), tmp_path)
+    program = (
+        "import sys; from warmprior.saving import load_policy; print(load_policy(sys.argv[1]).start.name)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True)
+    assert done.stdout == "agent\n", done.stderr
 
 
 def test_the_policy_before_stays_as_it_is():

@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 from collections.abc import Container, Mapping
+from importlib import import_module
 from typing import Any, ClassVar
 
 __all__ = ["Registered", "from_config", "kept_arguments"]
@@ -105,7 +106,7 @@ def _keeps(part: object, name: str) -> bool:
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
-    """Build the object that :meth:`Registered.config` describes, without importing anything."""
+    """Build the object that :meth:`Registered.config` describes; nothing but the library is imported."""
     arguments = dict(config)
     name = arguments.pop("name", None)
     return registered(base, name, "import the module that defines it")(**arguments)
@@ -113,6 +114,9 @@ def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
 
 def registered[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
     """Return the subclass with a name; raise ValueError with the existing names and advice."""
+    if name not in base.classes:
+        # The library's own classes are known once their room is imported, and these are imported when used.
+        import_module("warmprior").__all__  # noqa: B018
     if name not in base.classes:
         raise ValueError(
             f"unknown {kind(base)} {name!r}: it is none of {', '.join(sorted(base.classes))}; {advice}"
