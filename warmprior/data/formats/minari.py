@@ -68,7 +68,7 @@ def _parsed(name: str | Path, folder: Path, metadata: bytes) -> Any:
 def _check_files(folder: Path) -> None:
     """Raise an error for files that cannot be opened, and if the metadata count other episodes."""
     for path in folder.rglob("*"):
-        if not path.is_dir():
+        if path.is_symlink() or not path.is_dir():  # what is behind a linked folder is not seen here
             check_regular(path)
     episodes = [path.name for path in folder.iterdir() if path.is_dir()]
     if (data := folder / "main_data.hdf5").exists():
