@@ -169,7 +169,7 @@ def test_single_steps_are_not_skipped():
 
 def test_single_steps_are_not_skipped_by_a_part_of_a_part_either():
     skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
-    env = TransformedEnv(CountingEnv(9), Compose(Compose(StepCounter(), skip), *policy_transforms(PRIOR)))
+    env = TransformedEnv(CountingEnv(9), Compose(Compose(skip), *policy_transforms(PRIOR)))
     refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
 
 
