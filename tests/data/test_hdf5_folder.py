@@ -137,3 +137,10 @@ def test_poses_beside_deltas_are_refused(tmp_path):
 def test_a_folder_without_recordings(tmp_path, capsys):
     assert main(["train", str(tmp_path)]) == 2
     assert not missing(capsys.readouterr().err, tmp_path, "*.hdf5", f"lerobot:{tmp_path}")
+
+
+def test_files_with_other_usual_endings_are_read_too(sessions):
+    folder, demos = sessions
+    (folder / "monday.hdf5").rename(folder / "monday.h5")
+    (folder / "sunday.hdf5").rename(folder / "sunday.HDF5")
+    check(open_demonstrations(folder).steps(), demos)

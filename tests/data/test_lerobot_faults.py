@@ -1,5 +1,7 @@
 import json
+import os
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from tests.errors import raises, refuses
+from tests.fuzz import sandbox
 from warmprior.data import DatasetError
 from warmprior.data.formats.lerobot import LeRobotDemonstrations
 
@@ -220,3 +223,16 @@ def test_bad_options(root):
     # Poses that are none: random numbers where a quaternion should be.
     with raises(DatasetError, "robot0_eef_quat", "episode 0", "row"):
         LeRobotDemonstrations(root, task=LIFT).steps(actions="absolute")
+
+
+@pytest.mark.parametrize("storage", ["memory", "memmap"])
+@pytest.mark.parametrize("file", ["meta/tasks.parquet", "meta/stats.json", "videos/*/*/*.mp4"])
+def test_a_pipe_is_not_waited_for(root, monkeypatch, file, storage):
+    (path,) = root.glob(file)
+    path.unlink()
+    os.mkfifo(path)
+    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 10.0)
+    read = partial(LeRobotDemonstrations(root).steps, images=["side_image"], storage=storage)
+    found = sandbox.attempt(read, str(root))
+    assert found.kind == "refused", found
+    assert "not a regular file" in found.detail

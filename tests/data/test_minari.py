@@ -210,6 +210,34 @@ def test_a_pipe_is_not_waited_for(root, file):
     refuses(lambda: MinariDemonstrations(name).index(), DatasetError, path, "not a regular file")
 
 
+@pytest.mark.parametrize("form", ["arrow", "parquet"])
+def test_a_linked_episode_is_refused(root, tmp_path, form):
+    """Behind the link may be a pipe, and the digest of the contents would not see a change there."""
+    name = written(data_format=form, success=False)
+    episode, elsewhere = root / "toy/walk/human-v0/data/1", tmp_path / "elsewhere"
+    episode.rename(elsewhere)
+    episode.symlink_to(elsewhere)
+    refuses(lambda: MinariDemonstrations(name).index(), DatasetError, episode, "not a regular file")
+
+
+@pytest.mark.parametrize("depth", [1, 40])
+def test_a_group_with_several_names_is_not_walked_through_for_ever(root, monkeypatch, depth):
+    """With a depth of 40 there are 2**40 ways to the last group."""
+    name = written()
+    (path,) = root.rglob("main_data.hdf5")
+    with h5py.File(path, "a") as file:
+        group = file["episode_1/infos"]
+        for _ in range(depth):
+            inner = group.create_group("arm")
+            group["hand"], group = inner, inner
+        group["base"] = file["episode_1"]
+    monkeypatch.setattr(sandbox, "LIMIT_SECONDS", 10.0)
+    found = sandbox.attempt(MinariDemonstrations(name).steps, str(path))
+    assert found.kind == "refused", found
+    assert "another name" in found.detail
+    assert len(found.detail) < 1000
+
+
 def test_an_environment_that_does_not_take_what_was_recorded(root):
     """As of another version of its package."""
     name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)

@@ -440,6 +440,26 @@ def test_the_policys_own_normaliser():
         AsyncExecutor(plain, latency=0, normalizer=Normalizer.fit(raw, ("observation",)))
 
 
+def test_statistics_that_are_loaded_between_two_episodes():
+    def bounds(high):
+        numbers = {
+            "observation": torch.full((OBSERVATION_DIM,), high),
+            "action": torch.full((ACTION_DIM,), high),
+        }
+        return Normalizer({key: -value for key, value in numbers.items()}, numbers)
+
+    policy, other = (mlp_actor(PastPrior(4), normalizer=bounds(high)) for high in (1.0, 9.0))
+    raw, found = torch.ones(OBSERVATION_DIM), []
+    with AsyncExecutor(policy, latency=0) as executor:
+        executor.act(raw)
+        policy.load_state_dict(other.state_dict())
+        executor.reset()
+        for each in (executor, AsyncExecutor(policy, latency=0)):
+            torch.manual_seed(0)
+            found.append(each.act(raw))
+    assert torch.equal(*found)
+
+
 def test_a_delay_behind_what_is_guided():
     """Guidance refuses such delays: the robot goes on all the same."""
     guided = actor(PreviewPrior(6), guidance=RealTimeChunking(horizon=2))

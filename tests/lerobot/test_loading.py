@@ -103,6 +103,7 @@ def test_damaged_weights_are_named(found, saved, tmp_path):
     ("option", "value"),
     [
         *(("input_features", None), ("prior", None), ("prior", "past,sigma=1e30"), ("nfe", 0), ("nfe", [])),
+        *(("nfe", None), ("resize", None)),
         ("output_features", {"action": {"type": "ACTION", "shape": [10**30]}}),
     ],
 )

@@ -24,6 +24,20 @@ CAMERAS = ("agentview_image", "robot0_eye_in_hand_image")
 SIZE, CROP, STATE = 12, 8, 3
 
 
+@pytest.mark.parametrize("size", [0, 7, 1025, 10**6, None, 12.0])
+def test_sizes_of_images_that_no_decision_can_see(size):
+    refuses(
+        lambda: ImageEncoder(CAMERAS, STATE, image_size=size, backbone="small"),
+        ValueError,
+        "image_size",
+        size,
+    )
+
+
+def test_the_smallest_images():
+    assert [ImageEncoder(CAMERAS, STATE, image_size=n, backbone="small").crop_size for n in (8, 9)] == [8, 8]
+
+
 def encoder_of(**options):
     given = {"image_size": SIZE, "crop_size": CROP, "backbone": "small"} | options
     if given["backbone"] == "resnet18":

@@ -12,6 +12,7 @@ from torchrl.envs import (
     ConditionalSkip,
     FrameSkipTransform,
     GymEnv,
+    MultiAction,
     ParallelEnv,
     RenameTransform,
     SerialEnv,
@@ -164,6 +165,17 @@ def test_single_steps_are_not_skipped():
     transforms = Compose(ObservationStack(1), skip, ChunkStep(H), ActionHistory(H))
     env = TransformedEnv(CountingEnv(9), transforms)
     refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
+
+
+def test_single_steps_are_not_skipped_by_a_part_of_a_part_either():
+    skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
+    env = TransformedEnv(CountingEnv(9), Compose(Compose(skip), *policy_transforms(PRIOR)))
+    refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
+
+
+def test_single_actions_are_no_chunk():
+    env = TransformedEnv(CountingEnv(9), Compose(*policy_transforms(PRIOR), MultiAction()))
+    refuses(lambda: env.rollout(2, POLICY), ValueError, f"[*B, {H}, d_a]")
 
 
 @pytest.mark.parametrize("batch", [SerialEnv, None])

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 from tensordict import TensorDictBase
 
-from warmprior.checks import check_choice, check_whole_numbers, given
+from warmprior.checks import check_between, check_choice, check_whole_numbers, given
 from warmprior.data.frames import cached_images
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
@@ -19,7 +19,7 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 from warmprior.modules.trend import vector_of
-from warmprior.options.data import IMAGE_SIZE, Resize
+from warmprior.options.data import IMAGE_SIZE, LARGEST_IMAGE, Resize
 
 ROWS = 2_000  # number of steps that decide if an observation is an action
 LATER = 16  # number of steps, from the same one on, whose actions are compared
@@ -75,6 +75,7 @@ class Demonstrations:
         resize: Resize = "squeeze",
     ) -> None:
         check_whole_numbers(**given(image_size=image_size))
+        check_between(1, LARGEST_IMAGE, **given(image_size=image_size))
         check_choice("resize", resize, get_args(Resize))
         self.place, self.demos, self.mask, self.style, self.task = place, demos, mask, style, task
         self.image_size, self.resize = image_size, resize

@@ -147,6 +147,7 @@ class AsyncExecutor:
         # Guidance raises an error for delays longer than its horizon.
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
         self._reach = getattr(guidance, "horizon", None) or length
+        self._statistics = normalizer
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._postprocess = getattr(plain, "postprocess", None)
         self._observed = RobotObservation(
@@ -212,6 +213,9 @@ class AsyncExecutor:
         with self._lock:
             if self._closed:
                 raise RuntimeError("the executor is closed")
+            if not self._frames and self._statistics is not None and self._normalizer is not None:
+                # Others may have been loaded into the policy.
+                self._normalizer.load_state_dict(self._statistics.state_dict())
             # An episode's first observation fills the stack.
             self._frames.extend([self._observed(observation)] * (1 if self._frames else self._stacked))
             self._collect()

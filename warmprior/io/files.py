@@ -84,8 +84,16 @@ def check_regular(path: Path) -> None:
         raise ValueError(f"{path} is not a regular file; remove it, or choose another folder")
 
 
+def check_regular_files(folder: Path) -> None:
+    """Raise an error for anything in a folder that is neither a folder of its own nor a regular file."""
+    for path in folder.rglob("*"):
+        if path.is_symlink() or not path.is_dir():  # what is behind a linked folder is not seen here
+            check_regular(path)
+
+
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file's content."""
+    check_regular(path)
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

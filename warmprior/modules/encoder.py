@@ -26,7 +26,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config, kept_arguments
-from warmprior.options.data import IMAGE_SIZE, Resize
+from warmprior.options.data import IMAGE_SIZE, LARGEST_IMAGE, Resize
 
 Backbone = Literal["resnet18", "small"]
 
@@ -70,7 +70,7 @@ class ImageEncoder(nn.Module):
         cameras: names of the images in the observation.
         state_dim: width of the observation's vector ``"state"``; 0 if there is none.
         image_size: side of the images in pixels.
-        crop_size: side of the crop in pixels; by default 76 of 84, in proportion.
+        crop_size: side of the crop in pixels; by default 76 of 84, in proportion, but at least 8.
         backbone: ``"resnet18"``, or ``"small"``: three convolutions and a linear layer, for small budgets.
         share: True uses one network for all cameras.
         resize: how cameras' images of another size were resized, and are on a robot, see
@@ -106,7 +106,9 @@ class ImageEncoder(nn.Module):
         cameras = tuple(cameras)
         check_distinct("cameras of an image encoder", cameras)
         check_whole_numbers(0, state_dim=state_dim)
-        crop_size = round(_CROPPED * image_size) if crop_size is None else crop_size
+        check_whole_numbers(image_size=image_size)
+        check_between(8, LARGEST_IMAGE, image_size=image_size)
+        crop_size = max(8, round(_CROPPED * image_size)) if crop_size is None else crop_size
         check_between(8, image_size, crop_size=crop_size)
         check_choice("backbone", backbone, get_args(Backbone))
         check_choice("resize", resize, get_args(Resize))

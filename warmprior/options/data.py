@@ -19,6 +19,9 @@ PLACES = (
 IMAGE_SIZE = 84
 """The default side of images in pixels, as in the paper (Table 3)."""
 
+LARGEST_IMAGE = 1024
+"""The largest side of images that policies see: a decision on larger ones takes gigabytes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Resizing:

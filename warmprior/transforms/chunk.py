@@ -266,7 +266,7 @@ class ChunkStep(EnvTransform):
         chunks = {}
         for action_key, chunk_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             chunks[action_key] = chunk = tensordict.get(chunk_key)
-            if chunk is None or chunk.shape[-2] != self.prediction_length:
+            if chunk is None or chunk.shape[-2:-1] != (self.prediction_length,):
                 raise ValueError(
                     f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at {chunk_key}, found "
                     f"{'nothing' if chunk is None else tuple(chunk.shape)}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -157,6 +157,10 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def validate_features(self) -> None:
         """Raise ValueError for a dataset that the policy cannot learn from."""
+        for option in fields(self):
+            # JSON holds null for any of them.
+            if getattr(self, option.name) is None and option.default not in (None, MISSING):
+                raise ValueError(f"--policy.{option.name} needs a value, such as {option.default!r}")
         encoders = ("resnet18-imagenet", "resnet18", "small")
         if self.encoder not in encoders:
             raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")

@@ -80,13 +80,21 @@ def member(
         return item
 
 
-def check_members(parent: h5py.Group, name: str) -> None:
-    """Raise DatasetError unless what is below ``parent`` is fully stored in this file, with all it holds."""
-    with reading(parent, name):  # a group that holds itself ends in a RecursionError
+def check_members(parent: h5py.Group, name: str, met: set[int] | None = None) -> None:
+    """Raise DatasetError unless what is below ``parent`` is fully stored in this file, with all it holds.
+
+    A group under two names, ``met`` before, is refused: one that holds itself has no end.
+    """
+    met = set() if met is None else met
+    with reading(parent, name):
         item = member(parent, name)
         if isinstance(item, require("h5py", "sim").Group):
+            place = require("h5py.h5o", "sim").get_info(item.id).addr
+            if place in met:
+                raise DatasetError(f"{_place(parent, name)} is a group with another name as well. {_AGAIN}")
+            met.add(place)
             for inner in names(item):
-                check_members(item, inner)
+                check_members(item, inner, met)
         elif item is not None and item.dtype.hasobject:
             item[()]  # which checks its heaps
 

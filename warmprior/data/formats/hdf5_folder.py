@@ -37,11 +37,16 @@ class RobomimicFolder(Demonstrations):
         """The files, each with all of its demonstrations, or those of the mask."""
         self.check()
         options: dict[str, Any] = {"mask": self.mask, "image_size": self.image_size, "resize": self.resize}
-        return [RobomimicDemonstrations(path, **options) for path in sorted(Path(self.place).glob("*.hdf5"))]
+        return [RobomimicDemonstrations(path, **options) for path in self.paths]
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files' paths, with any of the usual endings."""
+        return sorted(p for p in Path(self.place).iterdir() if p.suffix.lower() in (".hdf5", ".h5"))
 
     @override
     def check(self) -> None:
-        if not any(Path(self.place).glob("*.hdf5")):
+        if not self.paths:
             other = f"a LeRobotDataset is lerobot:{self.place}"
             raise FileNotFoundError(f"{self.place}: no file *.hdf5 in this folder; {other}")
 

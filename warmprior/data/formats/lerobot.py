@@ -29,6 +29,7 @@ from warmprior.data.index import DatasetIndex, DemonstrationReader, reading, sto
 from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import task_env_args
 from warmprior.io.extras import require
+from warmprior.io.files import check_regular
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
@@ -114,6 +115,7 @@ class LeRobotReader(DemonstrationReader):
         shape = (3, *self.index.image_shapes[self.index.image_keys.index(key)])
         length, step = episode["length"], max(1, DECODED // prod(shape))
         with reading(f"{path}", _AGAIN):
+            check_regular(path)
             frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
             for first in range(0, length, step):
                 stop = min(first + step, length)

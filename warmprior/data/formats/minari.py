@@ -29,7 +29,7 @@ from warmprior.data.index import (
     unknown_name_error,
 )
 from warmprior.io.extras import require
-from warmprior.io.files import check_regular, digest_of, file_digest, read_json
+from warmprior.io.files import check_regular_files, digest_of, file_digest, read_json
 
 _AGAIN = "Download it again."
 
@@ -67,9 +67,7 @@ def _parsed(name: str | Path, folder: Path, metadata: bytes) -> Any:
 
 def _check_files(folder: Path) -> None:
     """Raise an error for files that cannot be opened, and if the metadata count other episodes."""
-    for path in folder.rglob("*"):
-        if not path.is_dir():
-            check_regular(path)
+    check_regular_files(folder)
     episodes = [path.name for path in folder.iterdir() if path.is_dir()]
     if (data := folder / "main_data.hdf5").exists():
         with open_hdf5(data) as file:
