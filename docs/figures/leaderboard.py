@@ -60,6 +60,8 @@ HUMAN = Sets(
         ("Push-T, 206", PUSHT, "pusht_206_45000"),
     )
 )
+LEARNED_L1 = Sets((name, (task, (f"{runs[0]}_learned_l1",))) for name, (task, runs) in HUMAN.items())
+"""The same demonstrations, all sources with an L1 loss."""
 
 SCRIPTED = Sets((f"{task}, 25", (task, GROUPS[TWENTY_FIVE])) for task in ("square", "can", "stack"))
 TITLES = {

@@ -6,10 +6,11 @@ The tests look for each in its page. A sentence that is not there has older numb
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 from comparisons import Comparison
-from leaderboard import SCRIPTED, beside_source, paper_gain, standings
+from leaderboard import LEARNED_L1, SCRIPTED, beside_source, paper_gain, standings
 from pandas import DataFrame
 from results import (
     AGENTS,
@@ -118,6 +119,8 @@ def sentences() -> dict[str, list[str]]:
     fifty = [whole(pusht[50][s]) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     past, preview_once, mip = (beside_source(*s) for s in ((PAST, 9), (PREVIEW, 1), ("mip", 2)))
+    cvae_l1 = partial(beside_source, f"{CVAE},l1", baseline=f"{GAUSSIAN},l1", sets=LEARNED_L1)
+    with_l1, with_l1_at_best = ({n: cvae_l1(n, own_noise=own) for n in (9, 1)} for own in (True, False))
     at_best = {n: beside_source(CVAE, n, own_noise=False) for n in (9, 3, 1)}
     past_once = beside_source(PAST, 1, sets=SCRIPTED)
     learned = {n: beside_source(CVAE, n) for n in (9, 1)}
@@ -161,11 +164,19 @@ def sentences() -> dict[str, list[str]]:
             f"WP-Preview solves fewer episodes at NFE 1 ({preview_once.in_trainings}, {preview_once.chance})",
             f"With each source at its best noise it leads at NFE 3 and 1 ({at_best[3].chance} each), "
             f"but not clearly at NFE 9 ({at_best[9].chance})",
+            f"leads at NFE 9 ({whole(with_l1[9].rates[0])}% against {whole(with_l1[9].rates[1])}%, "
+            f"{with_l1[9].chance}), but not with each at its best noise ({with_l1_at_best[9].chance})",
             f"may be due to chance at NFE 9 ({learned_mip[9].chance}) and NFE 1 ({learned_mip[1].chance})",
         ],
         "results.md": [
             f"With 25, WP-Past is {past_once.gain:.0f} points ahead ({past_once.in_trainings}, "
             f"{past_once.chance})",
+        ],
+        "notes/evidence.md": [
+            f"at NFE {nfe} it solves {whole(of.rates[0])}% against {whole(of.rates[1])}% "
+            f"({of.in_trainings}, {of.chance})"
+            for of_all in (with_l1, with_l1_at_best)
+            for nfe, of in of_all.items()
         ],
         "prior_space_rl.md": [
             f"WP-Past's agent rises from {improved(f'DSRL-NA, {SOURCES[PAST][0]}')}, "
