@@ -15,6 +15,7 @@ from torchrl.envs import (
     MultiAction,
     ParallelEnv,
     RenameTransform,
+    RewardScaling,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -171,6 +172,23 @@ def test_single_steps_are_not_skipped_by_a_part_of_a_part_either():
     skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
     env = TransformedEnv(CountingEnv(9), Compose(Compose(skip), *policy_transforms(PRIOR)))
     refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
+
+
+class Doubled(Compose):
+    def _step(self, tensordict, next_tensordict):
+        result = super()._step(tensordict, next_tensordict)
+        return result.set("reward", 2 * result["reward"])
+
+
+def test_transforms_that_are_composed_of_others_step_as_wholes():
+    """Their own part, which none of the others has, is that of each action of a chunk."""
+
+    def rewards(kind):
+        env = TransformedEnv(CountingEnv(9), Compose(kind(RewardScaling(0, 1)), *policy_transforms(PRIOR)))
+        return env.rollout(3, POLICY)["next", "reward"]
+
+    plain = rewards(Compose)
+    assert plain.sum() > 0 and torch.equal(rewards(Doubled), 2 * plain)
 
 
 def test_single_actions_are_no_chunk():

@@ -295,7 +295,8 @@ class ChunkStep(EnvTransform):
                 )
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
-            below = [f"{type(transform).__name__}(" for transform in inner.transforms]
+            parts = [part for transform in inner.transforms for part in flat(transform)]
+            below = [f"{type(part).__name__}(" for part in parts]
             for refused, why in _REFUSED.items():
                 if any(f"{refused.__name__}(" in text for text in (*below, *_descriptions(inner.base))):
                     raise RuntimeError(f"ChunkStep cannot come after {refused.__name__}, {why}")

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 from warmprior.checks import check_keys
-from warmprior.transforms.restarts import NATIVE, Restarts, flat
+from warmprior.transforms.restarts import NATIVE, Restarts
 
 KEPT = "_kept"
 """The key of observations that :func:`set_aside` keeps, at the root of a step's input."""
@@ -91,7 +91,6 @@ class InnerStep:
                 f"{type(transform).__name__} only steps environments: append it to a TransformedEnv"
             )
         self.base: EnvBase = container.base_env
-        before = [part for transform in before for part in flat(transform)]  # which are checked by class
         self.transforms = before
         self.restarts = Restarts(container, before)
         states = set(self.base.state_spec.keys(True, True))
