@@ -22,7 +22,7 @@ from warmprior.data.index import (
 )
 from warmprior.envs.robosuite_tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
-from warmprior.io.files import check_regular_files, digest_of, file_digest, is_repository, read_json
+from warmprior.io.files import check_regular, digest_of, file_digest, is_repository, read_json
 from warmprior.lerobot.names import ROBOT_STATE, named_joints, number_names, short_names
 
 if TYPE_CHECKING:
@@ -135,7 +135,9 @@ def _metadata(root: Path) -> Any:
     datasets = require("lerobot.datasets", "lerobot")
     again = "Copy, download, record or convert it again."
     with reading(f"{root}: LeRobot's meta/", again):
-        check_regular_files(root / "meta")
+        for opened in ("info.json", "stats.json", "tasks.parquet", "episodes/*/*.parquet"):
+            for path in (root / "meta").glob(opened):
+                check_regular(path)
         version = _check_info(read_json(root / "meta" / "info.json"))
     if version != LEROBOT_VERSION:
         raise DatasetError(
