@@ -81,7 +81,7 @@ def write_robomimic_file(
             entry["dones"] = (demo["rewards"] > 0).astype(np.int64)
             entry["states"] = rng.normal(size=(steps, 45))
             entry["obs/robot0_eef_vel_lin"] = rng.normal(size=(steps, 3))
-            entry["obs/agentview_image"] = np.zeros((steps, 4, 4, 3), np.uint8)
+            entry["obs/agentview_image"] = np.zeros((steps, 8, 8, 3), np.uint8)
             demos.append(demo)
         for key, numbers in (masks or {}).items():
             file[f"mask/{key}"] = np.array([f"demo_{n}".encode() for n in numbers], dtype="S")

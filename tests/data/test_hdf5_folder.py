@@ -93,7 +93,7 @@ def wider(name):
         for demo in file["data"].values():
             values = demo[name][()]
             del demo[name]
-            demo[name] = np.zeros((len(values), 8, 8, 3), np.uint8)
+            demo[name] = np.zeros((len(values), 10, 10, 3), np.uint8)
 
     return change
 
@@ -109,7 +109,7 @@ def other_rate(file):
     [
         (without("rewards"), ["rewards", "False"]),
         (other_rate, ["env_args", "monday.hdf5"]),
-        (wider("obs/agentview_image"), ["image_shapes", "(8, 8)", "(4, 4)"]),
+        (wider("obs/agentview_image"), ["image_shapes", "(10, 10)", "(8, 8)"]),
         (without("obs/object"), ["'object'"]),
     ],
 )

@@ -216,6 +216,21 @@ def test_demos_have_cameras_of_one_size(tmp_path):
         open_demonstrations(tmp_path / "mixed.hdf5").steps(images=["front"])
 
 
+@pytest.mark.parametrize("side", [7, 1025])
+def test_squares_that_no_policy_sees_are_refused_before_they_are_read(tmp_path, monkeypatch, side):
+    path = tmp_path / "squares.hdf5"
+    with h5py.File(path, "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo["actions"], demo["obs/joints"] = np.zeros((2, 2)), np.zeros((2, 2))
+        demo["obs/front"] = np.zeros((2, side, side, 3), np.uint8)
+    with monkeypatch.context() as patched:
+        patched.delattr(RobomimicReader, "images")
+        with raises(DatasetError, "front has", f"{side} pixels", "8 to 1024", "image_size"):
+            open_demonstrations(path).steps(images=["front"])
+    shown = open_demonstrations(path, image_size=8).steps(images=["front"])
+    assert shown["observation", "front"].shape == (2, 3, 8, 8)
+
+
 def test_a_simulator_renders_at_the_stored_size(monkeypatch):
     rng = np.random.default_rng(0)
     shown = {"front": scene(60, 80, rng), "wrist": scene(50, 50, rng)}

@@ -226,7 +226,9 @@ def test_bad_options(root):
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])
-@pytest.mark.parametrize("file", ["meta/tasks.parquet", "meta/stats.json", "videos/*/*/*.mp4"])
+@pytest.mark.parametrize(
+    "file", ["meta/tasks.parquet", "meta/stats.json", "data/*/*.parquet", "videos/*/*/*.mp4"]
+)
 def test_a_pipe_is_not_waited_for(root, monkeypatch, file, storage):
     (path,) = root.glob(file)
     path.unlink()

@@ -103,7 +103,7 @@ def test_damaged_weights_are_named(found, saved, tmp_path):
     ("option", "value"),
     [
         *(("input_features", None), ("prior", None), ("prior", "past,sigma=1e30"), ("nfe", 0), ("nfe", [])),
-        *(("nfe", None), ("resize", None)),
+        *(("nfe", None), ("dropout", None), ("normalization_mapping", None)),
         ("output_features", {"action": {"type": "ACTION", "shape": [10**30]}}),
     ],
 )
@@ -112,6 +112,14 @@ def test_a_configuration_of_which_nothing_can_be_built(found, saved, tmp_path, o
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | {option: value}))
     refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "cannot be built")
+
+
+@pytest.mark.parametrize("option", ["sigma_unit", "cold_probability"])
+def test_null_for_an_option_of_the_source(found, saved, option, tmp_path):
+    saved("warm_smolvla")
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {option: None}))
+    refuses(lambda: load(found, "warm_smolvla", tmp_path), ValueError, tmp_path, f"--policy.{option} needs")
 
 
 def test_weights_of_another_size_are_named_in_one_line(found, saved, tmp_path):

@@ -19,7 +19,7 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 from warmprior.modules.trend import vector_of
-from warmprior.options.data import IMAGE_SIZE, LARGEST_IMAGE, Resize
+from warmprior.options.data import IMAGE_SIZE, IMAGE_SIZES, Resize
 
 ROWS = 2_000  # number of steps that decide if an observation is an action
 LATER = 16  # number of steps, from the same one on, whose actions are compared
@@ -75,7 +75,7 @@ class Demonstrations:
         resize: Resize = "squeeze",
     ) -> None:
         check_whole_numbers(**given(image_size=image_size))
-        check_between(1, LARGEST_IMAGE, **given(image_size=image_size))
+        check_between(*IMAGE_SIZES, **given(image_size=image_size))
         check_choice("resize", resize, get_args(Resize))
         self.place, self.demos, self.mask, self.style, self.task = place, demos, mask, style, task
         self.image_size, self.resize = image_size, resize
@@ -152,6 +152,12 @@ class Demonstrations:
         found = tuple(shapes[key] for key in images)
         sides = {side for shape in found for side in shape}
         size = self.image_size or (IMAGE_SIZE if len(sides) > 1 else max(sides, default=0))
+        least, largest = IMAGE_SIZES
+        if images and not least <= size <= largest:
+            raise DatasetError(
+                f"{self}: {images[0]} has {size} pixels a side, and policies see {least} to {largest}: "
+                f"choose image_size, such as {IMAGE_SIZE}"
+            )
         return {
             "image_keys": tuple(images),
             "image_shapes": found,

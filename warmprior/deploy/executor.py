@@ -56,7 +56,8 @@ class AsyncExecutor:
 
     The normaliser, the number of stacked observations, and the observations' names and sizes come from the
     policy. Camera images may have any size: they are resized as those of the training were, and the encoder
-    takes the central crop.
+    takes the central crop. Weights that are loaded into the policy are used from the next decision on, and
+    a normaliser's statistics from the next :meth:`reset` on.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, an :class:`ExportedPolicy`, a

@@ -26,7 +26,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import as_json
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config, kept_arguments
-from warmprior.options.data import IMAGE_SIZE, LARGEST_IMAGE, Resize
+from warmprior.options.data import IMAGE_SIZE, IMAGE_SIZES, Resize
 
 Backbone = Literal["resnet18", "small"]
 
@@ -107,9 +107,9 @@ class ImageEncoder(nn.Module):
         check_distinct("cameras of an image encoder", cameras)
         check_whole_numbers(0, state_dim=state_dim)
         check_whole_numbers(image_size=image_size)
-        check_between(8, LARGEST_IMAGE, image_size=image_size)
-        crop_size = max(8, round(_CROPPED * image_size)) if crop_size is None else crop_size
-        check_between(8, image_size, crop_size=crop_size)
+        check_between(*IMAGE_SIZES, image_size=image_size)
+        crop_size = max(IMAGE_SIZES[0], round(_CROPPED * image_size)) if crop_size is None else crop_size
+        check_between(IMAGE_SIZES[0], image_size, crop_size=crop_size)
         check_choice("backbone", backbone, get_args(Backbone))
         check_choice("resize", resize, get_args(Resize))
         self.cameras, self.state_dim = cameras, state_dim

@@ -19,8 +19,8 @@ PLACES = (
 IMAGE_SIZE = 84
 """The default side of images in pixels, as in the paper (Table 3)."""
 
-LARGEST_IMAGE = 1024
-"""The largest side of images that policies see: a decision on larger ones takes gigabytes."""
+IMAGE_SIZES = (8, 1024)
+"""The least and largest side of images that policies see: a decision on larger ones takes gigabytes."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -13,7 +13,7 @@ from lerobot.optim.schedulers import LRSchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS
+from lerobot_policy_warmprior.configuration_warm_vla import OWN_PRIORS, check_given
 from warmprior import Prior
 from warmprior.checks import check_between, check_choice
 from warmprior.lerobot import history_indices
@@ -157,10 +157,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def validate_features(self) -> None:
         """Raise ValueError for a dataset that the policy cannot learn from."""
-        for option in fields(self):
-            # JSON holds null for any of them.
-            if getattr(self, option.name) is None and option.default not in (None, MISSING):
-                raise ValueError(f"--policy.{option.name} needs a value, such as {option.default!r}")
+        check_given(type(self), self)
         encoders = ("resnet18-imagenet", "resnet18", "small")
         if self.encoder not in encoders:
             raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -20,6 +20,14 @@ OWN_PRIORS = (
     "--env.discover_packages_path=PACKAGE"
 )
 """Hint for unknown priors: names may come from files, so they never import anything."""
+
+
+def check_given(options: Any, config: Any) -> None:
+    """Raise ValueError for options of a dataclass without a value, where JSON held null in its place."""
+    for option in fields(options):
+        default = option.default if option.default_factory is MISSING else option.default_factory()
+        if getattr(config, option.name) is None and default not in (None, MISSING):
+            raise ValueError(f"--policy.{option.name} needs a value, such as {default!r}")
 
 
 @dataclass
@@ -42,7 +50,8 @@ class WarmConfigMixin:
     cold_probability: float = 0.0
 
     def make_prior(self) -> Prior:
-        """Make the source; a ``ValueError`` if the name or an option is unknown."""
+        """Make the source; a ``ValueError`` if the name or an option is unknown, or an option is null."""
+        check_given(WarmConfigMixin, self)  # LeRobot asks for the steps to load before it validates
         kind = registered(Prior, self.prior.partition(",")[0], OWN_PRIORS)
         chunk = super().action_delta_indices  # type: ignore[misc]  # LeRobot's configuration has it
         room = len(chunk) // kind.prediction_chunks

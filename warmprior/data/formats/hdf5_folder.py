@@ -48,7 +48,7 @@ class RobomimicFolder(Demonstrations):
     def check(self) -> None:
         if not self.paths:
             other = f"a LeRobotDataset is lerobot:{self.place}"
-            raise FileNotFoundError(f"{self.place}: no file *.hdf5 in this folder; {other}")
+            raise FileNotFoundError(f"{self.place}: no file *.hdf5 or *.h5 in this folder; {other}")
 
     @override
     def index(

@@ -73,6 +73,7 @@ class LeRobotReader(DemonstrationReader):
             self._file, self._read = file, {}
         start, number = episode["dataset_from_index"], episode["episode_index"]
         with reading(f"{self.index.path / file}", _AGAIN):
+            check_regular(self.index.path / file)
             index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
             first = int(np.searchsorted(index, start))
             rows = slice(first, first + episode["length"])
