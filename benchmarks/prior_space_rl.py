@@ -149,7 +149,7 @@ def learn(
         description=name,
         collect=rounds,
     )
-    with torch_threads(1):  # TorchRL resets the number of threads when workers end
+    with torch_threads(None):  # TorchRL resets the number of threads when workers end
         training.run()
     return training
 

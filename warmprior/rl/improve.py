@@ -86,6 +86,9 @@ def improve_policy(
     evaluations is kept if it also solves more of other episodes, as the best of several is better by chance
     alone. The policies before and after then play a third set: that of ``python -m warmprior evaluate``.
 
+    The updates use as many threads as PyTorch does, while the workers wait. One seed repeats bit for bit with
+    the same number of threads.
+
     Args:
         policy: the policy, such as one of :func:`~warmprior.saving.load_policy`. It must solve some
             episodes: where it solves none, there is no reward to learn from.
@@ -152,7 +155,7 @@ def improve_policy(
         return env
 
     # TorchRL resets the number of threads when workers end.
-    with torch_threads(1), torch.random.fork_rng(devices=[]):
+    with torch_threads(None), torch.random.fork_rng(devices=[]):
         training = PriorSpaceTraining(
             policy,
             environment,
