@@ -126,6 +126,10 @@ def sentences() -> dict[str, list[str]]:
     learned = {n: beside_source(CVAE, n) for n in (9, 1)}
     learned_mip = {n: beside_source(CVAE, n, "mip") for n in (9, 1)}
     absolute = beside_source(f"{GAUSSIAN},l1", 9)
+    agents = (
+        f"WP-Past's agent rises from {improved(f'DSRL-NA, {SOURCES[PAST][0]}')}, "
+        f"the Gaussian source's from {improved(f'DSRL-NA, {SOURCES[GAUSSIAN][0]}')}"
+    )
     paper = {s: " / ".join(f"{paper_gain(s, nfe):.1f}" for nfe in (9, 3, 1)) for s in (PAST, PREVIEW)}
     return {
         "../README.md": [
@@ -144,6 +148,7 @@ def sentences() -> dict[str, list[str]]:
             "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
             f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at NFE 9 ({absolute.chance})",
+            agents,
             f"{paper[PAST]} points higher with WP-Past, and {paper[PREVIEW]} points higher with WP-Preview",
         ],
         "which_source.md": [
@@ -178,10 +183,7 @@ def sentences() -> dict[str, list[str]]:
             for of_all in (with_l1, with_l1_at_best)
             for nfe, of in of_all.items()
         ],
-        "prior_space_rl.md": [
-            f"WP-Past's agent rises from {improved(f'DSRL-NA, {SOURCES[PAST][0]}')}, "
-            f"the Gaussian source's from {improved(f'DSRL-NA, {SOURCES[GAUSSIAN][0]}')}",
-        ],
+        "prior_space_rl.md": [agents],
         "faq.md": [
             f"({whole(noise[0.1])}% at 0.1, {whole(noise[0])}% at 0), "
             f"and `sigma=1` solved more: {whole(noise[1])}%, against {whole(noise[0.5])}% at 0.5"
