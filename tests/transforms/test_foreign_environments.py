@@ -207,6 +207,22 @@ def test_single_steps_are_not_skipped_by_a_part_of_a_part_either():
     refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
 
 
+def test_another_policy_does_not_act_within_a_chunk():
+    """The history would lack its actions; between two chunks it is a decision like others."""
+
+    def switch(policy, place):
+        return ConditionalPolicySwitch(policy, lambda data: data["observation"].flatten()[place] == 2)
+
+    single = switch(lambda data: data.set("action", torch.ones(ACTION_DIM)), 0)
+    env = TransformedEnv(CountingEnv(9), Compose(single, *policy_transforms(PRIOR, observation_steps=1)))
+    refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalPolicySwitch")
+    transforms = policy_transforms(PRIOR, observation_steps=1, execute=2)
+    env = TransformedEnv(CountingEnv(9), Compose(*transforms, switch(POLICY, 0)))
+    after = env.step(POLICY(env.reset()))["next"]
+    assert after["history", "steps"] == after["observation"][0, 0] == 4
+    torch.testing.assert_close(after["history", "actions"][-1], after["observation"][0, 2:])
+
+
 class Doubled(Compose):
     def _step(self, tensordict, next_tensordict):
         result = super()._step(tensordict, next_tensordict)
