@@ -428,6 +428,26 @@ def test_policy_and_environment_need_one_normaliser():
         evaluate(agent, env, episodes=1, first_seed=0)
 
 
+def test_workers_keep_the_statistics_that_they_started_with():
+    ones = {"observation": torch.ones(2 + ACTION_DIM), "action": torch.ones(ACTION_DIM)}
+    mine, other = (Normalizer({k: -s * v for k, v in ones.items()}, ones) for s in (1.0, 3.0))
+    actor = mlp_actor(PRIOR, nfe=1, normalizer=mine)
+    for normalizer in (mine, other):
+        env = parallel_env(SeededEnv, partial(policy_transforms, PRIOR, normalizer=normalizer), 1)
+        with closing(env):
+            if normalizer is mine:
+                assert len(evaluate(actor, env, episodes=2, first_seed=0)) == 2
+                mine.load_state_dict(other.state_dict())
+                with raises(ValueError, "normalizer=policy.normalizer", "close"):
+                    evaluate(actor, env, episodes=2, first_seed=0)
+                env.close()
+            assert len(evaluate(actor, env, episodes=2, first_seed=0)) == 2
+    outside = TransformedEnv(SerialEnv(1, SeededEnv), policy_transforms(PRIOR, normalizer=other))
+    mine.action_scale.mul_(2)
+    with raises(ValueError, "normalizer=policy.normalizer"):
+        evaluate(actor, outside, episodes=2, first_seed=0)
+
+
 @pytest.mark.parametrize("batch", [None, SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
 @pytest.mark.parametrize(
     "outside", [FrameSkipTransform(2), ConditionalSkip(lambda data: data["executed_steps"] > 0)]

@@ -327,12 +327,19 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
                         f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: ask for "
                         "what it keeps, or give policy_transforms the same success and measures, and gamma=1"
                     )
+    _check_units(policy, env, parts)
+
+
+def _check_units(policy: TensorDictModuleBase, env: EnvBase, parts: list[Any]) -> None:
+    """Raise ValueError if the transforms of an environment are seen to lack the policy's normaliser."""
     # An agent acts through a policy's decoder, which keeps the normaliser that the policy had.
     owners = (getattr(part, "normalizer", None) for part in policy.modules())
     normalizer = next((own for own in owners if isinstance(own, Normalizer)), None)
-    if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
+    batched = isinstance(base_of(env), SerialEnv | ParallelEnv)
+    kinds: Any = FollowsNormalizer if batched else ActionScaling | ObservationNorm
+    scalers = [part for part in parts if isinstance(part, kinds)]
+    if normalizer is None or (batched and not scalers):
         return  # transforms inside workers cannot be inspected
-    scalers = [part for part in parts if isinstance(part, ActionScaling | ObservationNorm)]
     for part in scalers:
         if isinstance(part, FollowsNormalizer):
             part.follow()  # as the next reset does
@@ -344,8 +351,8 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
                 raise ValueError(
                     f"the policy was trained in the units of its normaliser, but the environment has "
                     f"{'another' if key in scalings else 'none'} for {key!r}: give policy_transforms(..., "
-                    "normalizer=policy.normalizer), or play policy.replace(normalizer=None) if the "
-                    "environment is in these units already"
+                    "normalizer=policy.normalizer), close workers that have started with another, or play "
+                    "policy.replace(normalizer=None) if the environment is in these units already"
                 )
 
 

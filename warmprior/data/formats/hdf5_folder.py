@@ -28,7 +28,10 @@ ENDINGS = (".hdf5", ".h5")
 
 
 class RobomimicFolder(Demonstrations):
-    """The demonstrations of all HDF5 files in a folder, in the order of the files' names."""
+    """The demonstrations of all HDF5 files in a folder, in the order of the files' names.
+
+    Those of folders below are not read; what is left out names them.
+    """
 
     prefix = ""
 
