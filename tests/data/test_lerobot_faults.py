@@ -203,6 +203,8 @@ def test_frames_of_another_episode_are_not_its_own(root, episode, start):
     with raises(DatasetError, root, "meta/episodes", "observation.images.side", episode):
         LeRobotDemonstrations(root, task=LIFT).steps(images=["side_image"])
     LeRobotDemonstrations(root, task=LIFT).steps(images=["agentview_image"])
+    if episode == 1:  # whose frames are now those of the first, and not of the last
+        LeRobotDemonstrations(root, task=LIFT, episodes=[2]).steps(images=["side_image"])
 
 
 def test_masks_and_episodes_are_some_of_those_that_there_are(root):

@@ -107,7 +107,7 @@ class RobomimicFolder(Demonstrations):
             lengths=tuple(lengths[: self.demos]),
             available_keys=tuple(present),
             # What some files lack cannot be chosen.
-            taken_by={key: min(found) for key, found in options.items()},
+            taken_by={key: found.pop() if len(found) == 1 else "" for key, found in options.items()},
             whole=self.demos in (None, len(demos)),
         )
 
