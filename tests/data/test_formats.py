@@ -117,3 +117,10 @@ def test_steps_and_their_demonstrations_train_the_same_policy():
 def test_help_names_the_places_of_every_format():
     prefixes = {kind.prefix for kind in opening.FORMATS} - {""}
     assert len(prefixes) > 1 and {prefix for prefix in prefixes if prefix in PLACES} == prefixes
+
+
+def test_what_steps_in_memory_hold_beside_the_observation_is_left_out_by_name():
+    steps = TensorDict({key: torch.rand(6, 2) for key in ("observation", "action", "force")}, [6])
+    steps["episode"], steps["frame"] = torch.arange(6) // 3, torch.arange(6)
+    steps["next", "done"] = steps["done"] = torch.zeros(6, 1, dtype=torch.bool)
+    assert demonstrations_of(steps).index().left_out == {"": ["force"]}

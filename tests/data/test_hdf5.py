@@ -9,6 +9,7 @@ import torch
 from tests.data.hdf5_faults import unreadable
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import raises, refuses
+from warmprior.data import open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
 from warmprior.data.index import DatasetError
 
@@ -194,3 +195,19 @@ def test_corrupt_values(tmp_path):
     RobomimicDemonstrations(path).index()
     with h5py.File(path) as file, raises(DatasetError, "data/demo_0/actions"):
         RobomimicReader(file).numbers("demo_0", "actions", np.empty((12, 7)))
+
+
+def test_what_only_some_demonstrations_have_is_left_out_by_name(square_file):
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        file["data/demo_2/obs/force"] = np.ones((len(file["data/demo_2/actions"]), 2))
+        del file["data/demo_1/obs/robot0_eef_vel_lin"]
+    left = {"": ["force", "robot0_eef_vel_lin"], "images": ["agentview_image"]}
+    assert open_demonstrations(path).index().left_out == left
+    assert open_demonstrations(path, demos=1).index().left_out == {
+        "images": ["agentview_image"],
+        "observations": ["robot0_eef_vel_lin"],
+    }
+    for key in left[""]:
+        with raises(DatasetError, f"{key!r}"):
+            open_demonstrations(path).index([key])

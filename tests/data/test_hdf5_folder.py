@@ -1,5 +1,8 @@
 """A folder of HDF5 files: one place, in the order of the files' names."""
 
+import os
+import shutil
+
 import h5py
 import numpy as np
 import pytest
@@ -144,3 +147,49 @@ def test_files_with_other_usual_endings_are_read_too(sessions):
     (folder / "monday.hdf5").rename(folder / "monday.h5")
     (folder / "sunday.hdf5").rename(folder / "sunday.HDF5")
     check(open_demonstrations(folder).steps(), demos)
+
+
+def test_what_is_not_read_of_a_folder_is_left_out_by_name(sessions, tmp_path, capsys):
+    folder, _ = sessions
+    for name in ("old/monday.hdf5", "old/older/sunday.H5", "spare/friday.hdf5"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / "friday.hdf5", folder / name)
+    (folder / "empty").mkdir()
+    shutil.copy(folder / "friday.hdf5", folder / "friday.backup")
+    os.mkfifo(folder / "pipe")
+    place, others = open_demonstrations(folder), ["friday.backup", "old/ with 2 files", "spare/ with 1 file"]
+    assert place.recording(place.index()).left_out[""] == others
+    assert Task(place).recording.left_out[""] == others
+    words = f"train {folder} --iterations 1 --hidden-dim 8 --out {tmp_path}"
+    assert main(words.split()) == 0
+    assert not missing(capsys.readouterr().out, *others)
+
+
+def test_a_folder_of_folders_names_them(sessions, capsys):
+    folder, _ = sessions
+    assert main(["train", str(folder.parent)]) == 2
+    assert not missing(capsys.readouterr().err, folder.parent, "sessions/ with 3 files")
+
+
+def more(name, value):
+    def change(file):
+        for demo in file["data"].values():
+            demo[name] = np.full((len(demo["actions"]), 2), value)
+
+    return change
+
+
+def test_what_only_some_files_have_is_left_out_by_name(sessions):
+    folder, _ = sessions
+    with h5py.File(folder / "sunday.hdf5", "a") as file:
+        more("obs/force", 1.0)(file)
+        without("obs/agentview_image")(file)
+    place = open_demonstrations(folder)
+    left = {"": ["agentview_image", "force"], "observations": ["robot0_eef_vel_lin"]}
+    assert place.index().left_out == left
+    for options, fact in (
+        ({"observations": ["force"]}, "'force'"),
+        ({"images": ["agentview_image"]}, "images"),
+    ):
+        with raises(DatasetError, fact):
+            place.index(**options)

@@ -154,6 +154,14 @@ VALUES = {
     "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
     "other episodes": (table(DATA, episode_index=entry(6, 0, None)), ["meta/episodes", "finalize()"]),
 }
+ELSEWHERE = {
+    f"{part} {kind}": (f"{part}SLASH{kind}_index", f"{part.replace('__', '.').replace('SLASH', '/')}/{file}")
+    for part, ending in (("data", "parquet"), ("videosSLASHobservation__images__side", "mp4"))
+    for kind, file in (
+        ("chunk", f"chunk-001/file-000.{ending}"),
+        ("file", f"chunk-000/file-001.{ending}"),
+    )
+}
 MOVIE = "videos/observation.images.side/chunk-000/file-000.mp4"
 IMAGES = {
     "missing camera": (lambda root: None, ["'front_image'", "agentview_image"], "front_image"),
@@ -176,6 +184,27 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
         monkeypatch.setattr("warmprior.data.formats.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
     with raises(DatasetError, root / DATA if name in VALUES else root, *said):
         LeRobotDemonstrations(root, task=LIFT).steps(images=keys)
+
+
+@pytest.mark.parametrize("storage", ["memory", "memmap"])
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_a_file_of_another_number_is_named(root, name, storage):
+    column, file = ELSEWHERE[name]
+    table(EPISODES, **{column: entry(1, 1, None)})(root)
+    with raises(DatasetError, root / file, "no such file", "finalize()"):
+        LeRobotDemonstrations(root, task=LIFT).steps(images=["side_image"], storage=storage)
+
+
+@pytest.mark.parametrize(("episode", "start"), [(1, 0.0), (2, 0.1), (0, 0.3)])
+def test_frames_of_another_episode_are_not_its_own(root, episode, start):
+    """LeRobot finds a frame for each of these times: one of an episode before or after."""
+    column = "videosSLASHobservation__images__sideSLASHfrom_timestamp"
+    table(EPISODES, **{column: entry(episode, start, None)})(root)
+    with raises(DatasetError, root, "meta/episodes", "observation.images.side", episode):
+        LeRobotDemonstrations(root, task=LIFT).steps(images=["side_image"])
+    LeRobotDemonstrations(root, task=LIFT).steps(images=["agentview_image"])
+    if episode == 1:  # whose frames are now those of the first, and not of the last
+        LeRobotDemonstrations(root, task=LIFT, episodes=[2]).steps(images=["side_image"])
 
 
 def test_masks_and_episodes_are_some_of_those_that_there_are(root):

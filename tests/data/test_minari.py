@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+import sys
 from itertools import product
 
 import gymnasium
@@ -11,7 +13,7 @@ import pytest
 import torch
 
 from tests.data.hdf5_faults import FAULTS, damage_heap, replace
-from tests.errors import raises, refuses
+from tests.errors import missing, raises, refuses
 from tests.fuzz import sandbox
 
 minari = pytest.importorskip("minari")
@@ -76,8 +78,9 @@ def written(name="toy/walk/human-v0", observation=VECTOR, action=ACTION, success
     return name
 
 
-def test_steps_are_those_of_minari():
-    name = written()
+@pytest.mark.parametrize("form", ["hdf5", "parquet", "arrow"])
+def test_steps_are_those_of_minari(form):
+    name = written(data_format=form, success=form == "hdf5")
     data = MinariDemonstrations(name).steps()
     assert data["episode"].tolist() == [i for i, n in enumerate(LENGTHS) for _ in range(n)]
     for i, episode in enumerate(minari.load_dataset(name).iterate_episodes()):
@@ -195,6 +198,34 @@ def test_episodes_that_metadata_do_not_count(root, form, count):
     refuses(lambda: MinariDemonstrations(name).index(), DatasetError, metadata.parent, "metadata.json", count)
     change(metadata, total_episodes=len(LENGTHS), total_steps=str(count))
     refuses(lambda: MinariDemonstrations(name).index(), DatasetError, metadata.parent, count)
+
+
+@pytest.mark.parametrize("form", ["parquet", "arrow"])
+def test_an_episode_has_one_file(root, form):
+    """Minari reads one of several, whichever it finds first."""
+    name, episode = written(data_format=form, success=False), root / "toy/walk/human-v0/data/1"
+    part = episode / f"part-0.{form}"
+    shutil.copy(part, episode / f"part-1.{form}")
+    refuses(lambda: MinariDemonstrations(name).index(), DatasetError, episode, part.name, f"part-1.{form}")
+    (episode / f"part-1.{form}").unlink()
+    part.write_bytes(part.read_bytes()[:300])
+    refuses(lambda: MinariDemonstrations(name).steps(), DatasetError, part)
+    part.unlink()
+    refuses(lambda: MinariDemonstrations(name).index(), DatasetError, episode, 0)
+
+
+def test_a_form_of_files_that_is_unknown_or_not_installed(root, monkeypatch, capsys):
+    name, metadata = (
+        written(data_format="parquet", success=False),
+        root / "toy/walk/human-v0/data/metadata.json",
+    )
+    monkeypatch.setitem(sys.modules, "minari.dataset._storages.arrow_storage", None)
+    refuses(lambda: MinariDemonstrations(name).index(), ImportError, "arrow_storage")
+    assert main(["train", f"minari:{name}"]) == 2
+    assert not missing(capsys.readouterr().err, "arrow_storage")
+    change(metadata, data_format="zarr")
+    with raises(DatasetError, metadata.parent, "'zarr'", "hdf5, parquet, arrow"):
+        MinariDemonstrations(name).index()
 
 
 def change(path, **entries):

@@ -440,7 +440,8 @@ def test_the_policys_own_normaliser():
         AsyncExecutor(plain, latency=0, normalizer=Normalizer.fit(raw, ("observation",)))
 
 
-def test_statistics_that_are_loaded_between_two_episodes():
+@pytest.mark.parametrize("assign", [False, True])
+def test_statistics_that_are_loaded_between_two_episodes(assign):
     def bounds(high):
         numbers = {
             "observation": torch.full((OBSERVATION_DIM,), high),
@@ -452,7 +453,7 @@ def test_statistics_that_are_loaded_between_two_episodes():
     raw, found = torch.ones(OBSERVATION_DIM), []
     with AsyncExecutor(policy, latency=0) as executor:
         executor.act(raw)
-        policy.load_state_dict(other.state_dict())
+        policy.load_state_dict(other.state_dict(), assign=assign)
         executor.reset()
         for each in (executor, AsyncExecutor(policy, latency=0)):
             torch.manual_seed(0)

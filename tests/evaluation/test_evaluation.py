@@ -15,7 +15,15 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl._utils import _check_for_faulty_process
 from torchrl.data import Categorical
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    FrameSkipTransform,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from tests.envs.test_gymnasium import registered_dial
 from tests.errors import raises, refuses
@@ -409,6 +417,51 @@ def test_policy_and_environment_need_one_normaliser():
     for wrong in (None, other):
         with raises(ValueError, "normalizer=policy.normalizer"):
             play(wrong)
+    # An agent's decoder has a copy of the policy, and the environment the policy's own statistics.
+    env = TransformedEnv(SeededEnv(), Compose(*policy_transforms(actor), PriorAnchor(actor)))
+    decoder = PriorDecoder(actor, delta=0.5)
+    agent = TensorDictSequential(ResidualSampler(decoder), decoder)
+    assert evaluate(agent, env, episodes=1, first_seed=0)[0].steps == length_of(0)
+    mine.load_state_dict(other.state_dict(), assign=True)
+    assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
+    with raises(ValueError, "normalizer=policy.normalizer"):
+        evaluate(agent, env, episodes=1, first_seed=0)
+
+
+def test_workers_keep_the_statistics_that_they_started_with():
+    ones = {"observation": torch.ones(2 + ACTION_DIM), "action": torch.ones(ACTION_DIM)}
+    mine, other = (Normalizer({k: -s * v for k, v in ones.items()}, ones) for s in (1.0, 3.0))
+    actor = mlp_actor(PRIOR, nfe=1, normalizer=mine)
+    for normalizer in (mine, other):
+        env = parallel_env(SeededEnv, partial(policy_transforms, PRIOR, normalizer=normalizer), 1)
+        with closing(env):
+            if normalizer is mine:
+                assert len(evaluate(actor, env, episodes=2, first_seed=0)) == 2
+                mine.load_state_dict(other.state_dict())
+                with raises(ValueError, "normalizer=policy.normalizer", "close"):
+                    evaluate(actor, env, episodes=2, first_seed=0)
+                env.close()
+            assert len(evaluate(actor, env, episodes=2, first_seed=0)) == 2
+    outside = TransformedEnv(SerialEnv(1, SeededEnv), policy_transforms(PRIOR, normalizer=other))
+    mine.action_scale.mul_(2)
+    with raises(ValueError, "normalizer=policy.normalizer"):
+        evaluate(actor, outside, episodes=2, first_seed=0)
+
+
+@pytest.mark.parametrize("batch", [None, SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+@pytest.mark.parametrize(
+    "outside", [FrameSkipTransform(2), ConditionalSkip(lambda data: data["executed_steps"] > 0)]
+)
+def test_what_repeats_or_skips_chunks_from_outside_is_refused(batch, outside):
+    """Played, an episode of n steps would be one of n / 2, or never end."""
+
+    def make():
+        return TransformedEnv(SeededEnv(), policy_transforms(PRIOR))
+
+    inside = make() if batch is None else batch(2, make)
+    env = TransformedEnv(inside, Compose(StepCounter(), outside.clone()), auto_unwrap=False)
+    with closing(env), raises(RuntimeError, type(outside).__name__, "inside"):
+        evaluate(mlp_actor(PRIOR, nfe=1), env, episodes=2, first_seed=0)
 
 
 @pytest.mark.parametrize("given", [{"success": "solved"}, {"measures": {"reward": "sum"}}])

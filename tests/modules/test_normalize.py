@@ -3,6 +3,7 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, MultiOneHot
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -76,19 +77,32 @@ def test_whole_numbers_and_flags_become_floats_in_a_batch_too(dtype):
         assert torch.equal(env.rollout(3)["observation"].reshape(-1, 2), expected)
 
 
-def test_an_environment_follows_statistics_that_are_loaded_later():
-    first, second = (
-        Normalizer({"observation": torch.zeros(4)}, {"observation": torch.full((4,), high)})
-        for high in (4.0, 8.0)
-    )
-    env = TransformedEnv(CountingEnv(5), Compose(*normalizing_transforms(first)))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("assign", [False, True])
+@pytest.mark.parametrize("batch", [None, SerialEnv])
+def test_an_environment_follows_statistics_that_are_loaded_later(batch, assign, dtype):
+    """Also where others take their place: by assignment, or in a policy that was cast."""
+
+    def bounds(high):
+        numbers = {"observation": torch.full((4,), high), "action": torch.full((2,), high**2)}
+        return Normalizer({key: torch.zeros_like(value) for key, value in numbers.items()}, numbers)
+
+    def make():
+        return TransformedEnv(CountingEnv(5), Compose(*normalizing_transforms(first)))
+
+    first, second = bounds(4.0), bounds(8.0)
+    env = make() if batch is None else batch(1, make)
+    env.reset()
+    first.to(dtype)
     torch.manual_seed(0)
     raw = CountingEnv(5).rollout(3)
-    for loaded in (first, second):
-        first.load_state_dict(loaded.state_dict())
-        torch.manual_seed(0)  # the same actions
-        expected = loaded.normalize(raw)["observation"]
-        assert torch.equal(env.rollout(3)["observation"][:, 2:], expected[:, 2:])  # the others count
+    for loaded in (bounds(4.0), second):
+        first.load_state_dict(loaded.state_dict(), assign=assign)
+        normal = iter(loaded.normalize(raw)["action"])
+        play = TensorDictModule(lambda normal=normal: next(normal).expand(*env.batch_size, 2), [], ["action"])
+        found = env.rollout(3, play)
+        expected = loaded.normalize(raw["next"])["observation"]
+        torch.testing.assert_close(found["next", "observation"].reshape(3, 4)[:, 2:], expected[:, 2:])
 
 
 @pytest.mark.parametrize(

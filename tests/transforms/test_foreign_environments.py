@@ -5,10 +5,11 @@ from functools import partial
 import pytest
 import torch
 from tensordict import NonTensorData, NonTensorStack, TensorDict
-from torchrl.data import Categorical, Composite, MultiCategorical, NonTensor, OneHot, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, NonTensor, OneHot, Unbounded
 from torchrl.envs import (
     ActionDiscretizer,
     Compose,
+    ConditionalPolicySwitch,
     ConditionalSkip,
     FrameSkipTransform,
     GymEnv,
@@ -20,9 +21,10 @@ from torchrl.envs import (
     StepCounter,
     TransformedEnv,
 )
+from torchrl.envs.transforms import Transform
 
 from tests.errors import raises, refuses
-from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv, demonstrations, mlp_actor
+from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, demonstrations, mlp_actor, placed
 from warmprior import (
     ActionHistory,
     ChunkStep,
@@ -85,21 +87,52 @@ def integers(spec):
     return env
 
 
-@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.float64])
-def test_a_history_is_real_whatever_the_actions_are(dtype):
-    spec = {
-        torch.int64: MultiCategorical([5] * ACTION_DIM),
-        torch.bool: OneHot(ACTION_DIM),
-        torch.float64: Unbounded((ACTION_DIM,), dtype=torch.float64),
-    }[dtype]
-    expected = torch.float64 if dtype == torch.float64 else torch.float32
-    env = TransformedEnv(integers(spec), policy_transforms(PRIOR))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_history_has_the_precision_of_the_actions(dtype):
+    env = TransformedEnv(integers(Unbounded((ACTION_DIM,), dtype=dtype)), policy_transforms(PRIOR))
     data = env.reset()
     chunk = torch.full((H, ACTION_DIM), -3.31)
     after = env.step(data.set(keys.CHUNK, chunk))["next"]
     for place in (data, after):
-        assert place["history", "actions"].dtype == place["history", "forecast"].dtype == expected
+        assert place["history", "actions"].dtype == place["history", "forecast"].dtype == dtype
     torch.testing.assert_close(after["history", "actions"].float(), chunk)
+
+
+WHOLE = [
+    (Bounded(0, 9, (ACTION_DIM,), dtype=torch.int32), "[4, 2] of torch.int32"),
+    (MultiCategorical([5] * ACTION_DIM), "MultiCategorical [4, 2]"),
+    (OneHot(ACTION_DIM), "OneHot [4, 2] of torch.bool"),
+]
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(("spec", "kind"), WHOLE)
+def test_whole_numbers_are_no_actions_without_a_normaliser_either(place, spec, kind):
+    """The simulator would get real numbers, and the buffers of workers would cut them."""
+    with raises(TypeError, kind.replace("[", "[2, ") if "outside" in place else kind, "rounds"):
+        placed(place, lambda: policy_transforms(PRIOR), (9, 9), lambda n: integers(spec)).reset()
+
+
+class Rounded(Transform):
+    """Gives an environment whole numbers for a policy's real ones."""
+
+    def __init__(self):
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+
+    def _inv_apply_transform(self, action):
+        return action.round().to(torch.int32)
+
+    def transform_input_spec(self, input_spec):
+        leaf = input_spec["full_action_spec", "action"]
+        input_spec["full_action_spec", "action"] = Bounded(0.0, 9.0, leaf.shape)
+        return input_spec
+
+
+def test_rounded_numbers_are():
+    env = TransformedEnv(integers(WHOLE[0][0]), Compose(Rounded(), *policy_transforms(PRIOR)))
+    after = env.step(env.reset().set(keys.CHUNK, torch.full((H, ACTION_DIM), 3.31)))["next"]
+    assert after["observation"][-1, 2:].tolist() == [3.0] * ACTION_DIM
+    assert torch.equal(after["history", "actions"], torch.full((H, ACTION_DIM), 3.31))
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.uint8])
@@ -172,6 +205,22 @@ def test_single_steps_are_not_skipped_by_a_part_of_a_part_either():
     skip = ConditionalSkip(lambda tensordict: torch.tensor([False]))
     env = TransformedEnv(CountingEnv(9), Compose(Compose(skip), *policy_transforms(PRIOR)))
     refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalSkip")
+
+
+def test_another_policy_does_not_act_within_a_chunk():
+    """The history would lack its actions; between two chunks it is a decision like others."""
+
+    def switch(policy, place):
+        return ConditionalPolicySwitch(policy, lambda data: data["observation"].flatten()[place] == 2)
+
+    single = switch(lambda data: data.set("action", torch.ones(ACTION_DIM)), 0)
+    env = TransformedEnv(CountingEnv(9), Compose(single, *policy_transforms(PRIOR, observation_steps=1)))
+    refuses(lambda: env.rollout(2, POLICY), RuntimeError, "ConditionalPolicySwitch")
+    transforms = policy_transforms(PRIOR, observation_steps=1, execute=2)
+    env = TransformedEnv(CountingEnv(9), Compose(*transforms, switch(POLICY, 0)))
+    after = env.step(POLICY(env.reset()))["next"]
+    assert after["history", "steps"] == after["observation"][0, 0] == 4
+    torch.testing.assert_close(after["history", "actions"][-1], after["observation"][0, 2:])
 
 
 class Doubled(Compose):
@@ -277,7 +326,7 @@ class PerAgent(CountingEnv):
 def test_environments_that_chunks_do_not_fit():
     discrete = TransformedEnv(GymEnv("Pendulum-v1"), ActionDiscretizer(num_intervals=5))
     for base, fact in ((PerAgent(), "[3, 1]"), (discrete, "ActionDiscretizer")):
-        env = TransformedEnv(base, policy_transforms(PRIOR))
+        env = TransformedEnv(base, Compose(ObservationStack(1), ChunkStep(H)))
         zeros = torch.zeros(H, env.full_action_spec[keys.CHUNK].shape[-1])
         with raises(RuntimeError, fact):
             env.rollout(2, ChunkPolicy(lambda data, zeros=zeros: zeros))

@@ -186,10 +186,13 @@ def declared_poses(path: Path, env_args: Mapping[str, Any]) -> tuple[str, str] |
 
 @contextmanager
 def reading(what: str, advice: str) -> Iterator[None]:
-    """Turn any error inside into a DatasetError that says what cannot be read, with advice."""
+    """Turn any error inside into a DatasetError that says what cannot be read, with advice.
+
+    A package that is not installed is no fault of the file.
+    """
     try:
         yield
-    except (DatasetError, MemoryError):
+    except (DatasetError, ImportError, MemoryError):
         raise
     except Exception as error:  # errors of h5py, pyarrow and the like, OSError, KeyError for columns, ...
         reason = str(error) or repr(error)  # an assertion has no words

@@ -59,6 +59,10 @@ def demonstrations_of(
     return _Steps(steps, name, style=style, normalised=normalised, **sized)
 
 
+_NO_OBSERVATIONS = ("frame", "next", "done", "terminated", "truncated")
+"""Entries of steps that are read nowhere, and that nobody expects a policy to see."""
+
+
 class _Steps(Demonstrations):
     prefix = ""
 
@@ -89,6 +93,7 @@ class _Steps(Demonstrations):
         if steps[EPISODE].is_floating_point() or bool((steps[EPISODE] < 0).any()):
             raise ValueError(f"{EPISODE!r} of {name} must be whole numbers from 0 on, got {found}")
         self._values, self._vector = steps.select(*needed), vector
+        self._others = list(map(str, steps.exclude(*needed, *_NO_OBSERVATIONS).keys()))
 
     @property
     @override
@@ -116,7 +121,8 @@ class _Steps(Demonstrations):
             observation_keys=(OBSERVATION,),
             observation_dims=(self._values[self._vector].shape[-1],),
             **self.pictured(list(self._images), self._images),
-            available_keys=(OBSERVATION, *self._images),
+            available_keys=(OBSERVATION, *self._images, *self._others),
+            taken_by=dict.fromkeys(self._others, ""),
             action_dim=self._values[ACTION].shape[-1],
         )
 

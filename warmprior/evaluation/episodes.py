@@ -24,8 +24,10 @@ from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
+from warmprior.modules.normalize import Normalizer
 from warmprior.tasks.task import Task
-from warmprior.transforms.chunk import ChunkStep, Measures, check_measures
+from warmprior.transforms.chunk import ChunkStep, Measures, check_measures, check_outside
+from warmprior.transforms.normalize import FollowsNormalizer
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """A function that writes the next chunk."""
@@ -213,6 +215,7 @@ def evaluate(
             seeds in its rows, or adds an offset to them; if it lacks the policy's normaliser, or the
             policy has keys of its own; or if ``success`` or ``measures`` are given with a :class:`Task`.
         KeyError: see :func:`play_episode`.
+        RuntimeError: if a transform around workers repeats or skips chunks (:class:`~warmprior.ChunkStep`).
         WorkerError: a ``RuntimeError``, if a worker process dies.
 
     See Also:
@@ -310,6 +313,7 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
             )
     if keys.EXECUTED not in present or keys.ACTIONS not in present:
         raise KeyError(f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: see policy_transforms")
+    check_outside(env)
     parts = list(transforms_of(env))
     for part in parts:
         if isinstance(part, ChunkStep) and part.execute > 1:
@@ -323,10 +327,22 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
                         f"a chunk keeps the {has!r} of {key!r}, but the evaluation asks for {how!r}: ask for "
                         "what it keeps, or give policy_transforms the same success and measures, and gamma=1"
                     )
-    normalizer = getattr(policy, "normalizer", None)
-    if normalizer is None or isinstance(base_of(env), SerialEnv | ParallelEnv):
+    _check_units(policy, env, parts)
+
+
+def _check_units(policy: TensorDictModuleBase, env: EnvBase, parts: list[Any]) -> None:
+    """Raise ValueError if the transforms of an environment are seen to lack the policy's normaliser."""
+    # An agent acts through a policy's decoder, which keeps the normaliser that the policy had.
+    owners = (getattr(part, "normalizer", None) for part in policy.modules())
+    normalizer = next((own for own in owners if isinstance(own, Normalizer)), None)
+    batched = isinstance(base_of(env), SerialEnv | ParallelEnv)
+    kinds: Any = FollowsNormalizer if batched else ActionScaling | ObservationNorm
+    scalers = [part for part in parts if isinstance(part, kinds)]
+    if normalizer is None or (batched and not scalers):
         return  # transforms inside workers cannot be inspected
-    scalers = [part for part in parts if isinstance(part, ActionScaling | ObservationNorm)]
+    for part in scalers:
+        if isinstance(part, FollowsNormalizer):
+            part.follow()  # as the next reset does
     scalings: dict[NestedKey, Any] = {(part.in_keys_inv or part.in_keys)[0]: part for part in scalers}
     for key in normalizer.keys:
         for name in ("loc", "scale"):
@@ -335,8 +351,8 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
                 raise ValueError(
                     f"the policy was trained in the units of its normaliser, but the environment has "
                     f"{'another' if key in scalings else 'none'} for {key!r}: give policy_transforms(..., "
-                    "normalizer=policy.normalizer), or play policy.replace(normalizer=None) if the "
-                    "environment is in these units already"
+                    "normalizer=policy.normalizer), close workers that have started with another, or play "
+                    "policy.replace(normalizer=None) if the environment is in these units already"
                 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -27,9 +28,12 @@ class _StridedEnv(ParallelEnv):
 
     strided_seeds = True
     make_transforms: Callable[[], Compose]
+    started: Compose
+    """The transforms as the workers have them, which follow no policy of this process."""
 
     @override
     def _start_workers(self) -> None:
+        self.started = copy.deepcopy(self.make_transforms())
         try:
             super()._start_workers()
         except (ConnectionError, EOFError) as error:
@@ -84,7 +88,7 @@ def transforms_of(env: EnvBase) -> Iterator[nn.Module]:
         yield from transforms_of(env.base_env)
         yield from env.transform.modules()
     elif isinstance(env, _StridedEnv):
-        yield from env.make_transforms().modules()
+        yield from (env.make_transforms() if env.is_closed else env.started).modules()
 
 
 def base_of(env: EnvBase) -> EnvBase:

@@ -110,7 +110,8 @@ class PriorAnchor(EnvTransform):
         Workers without a seed, or with the same one, draw the same noise: append the transform outside them.
 
     Args:
-        actor: the policy. A learned prior is copied, and the copy moves with the environment.
+        actor: the policy. A learned prior is copied as it is then, and the copy moves with the environment:
+            load weights into the policy before.
 
     Raises:
         ValueError: if the lengths of the environment's history differ from the policy's.

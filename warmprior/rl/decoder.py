@@ -37,8 +37,8 @@ class PriorDecoder(TensorDictModuleBase):
     ``reset_parameters_recursive`` of the sequence reach the policy too.
 
     Args:
-        actor: the policy, which is copied, or an object with the same interface, such as
-            :class:`~warmprior.lerobot.LeRobotActor`.
+        actor: the policy, which is copied as it is then (load weights into it before), or an object with the
+            same interface, such as :class:`~warmprior.lerobot.LeRobotActor`.
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
             around a warm mean and 1.5 around zero.
         residual_length: the number ``R`` of residuals ``[*B, R, d_a]`` that the agent chooses, each held for

@@ -15,6 +15,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import (
     ActionDiscretizer,
     ActionScaling,
+    ConditionalPolicySwitch,
     ConditionalSkip,
     FrameSkipTransform,
     ObservationNorm,
@@ -60,8 +61,15 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
 
 _REFUSED: dict[type[Transform], str] = {
     ActionDiscretizer: "whose actions are indices, and those of chunks numbers: leave it out",
+    ConditionalPolicySwitch: "which acts within a chunk, unseen by the history: append it after",
     ConditionalSkip: "which skips single steps of a chunk: append it after, where it skips decisions",
 }
+
+_INSIDE: dict[type[Transform], str] = {
+    ConditionalSkip: "would skip chunks, which their executed steps do not show: append it inside, after it",
+    FrameSkipTransform: "would repeat chunks, of which the history sees one: append it inside, before it",
+}
+"""The transforms that have to be in the same environment as :class:`ChunkStep`."""
 
 
 def _descriptions(env: EnvBase) -> list[str]:
@@ -70,6 +78,19 @@ def _descriptions(env: EnvBase) -> list[str]:
         return [repr(env)]
     workers = env.meta_data if isinstance(env.meta_data, list) else [env.meta_data]
     return [worker.env_str for worker in workers]
+
+
+def check_outside(env: EnvBase) -> None:
+    """Raise RuntimeError if a transform outside of environments with :class:`ChunkStep` belongs inside.
+
+    From inside, such as in a worker, it cannot be seen.
+    """
+    while isinstance(env, TransformedEnv):
+        parts, env = list(flat(env.transform)), env.base_env
+        inside = any("ChunkStep(" in text for text in _descriptions(env))
+        for kind, why in _INSIDE.items() if inside else ():
+            if any(isinstance(part, kind) for part in parts):
+                raise RuntimeError(f"{kind.__name__} outside of the environment with ChunkStep {why}")
 
 
 class LateTransforms:
@@ -180,6 +201,11 @@ class ChunkStep(EnvTransform):
         ``VecNormV2``, update that memory in all rows, including those that a partial step leaves out. If rows
         may skip steps after a reset, place such transforms inside the workers. :class:`ObservationStack` has
         no such memory.
+
+    .. note::
+        What is outside of the environment, around workers that have this transform, cannot be seen from
+        here: a ``FrameSkipTransform`` there would repeat whole chunks, and a ``ConditionalSkip`` leave
+        ``"executed_steps"`` as it was. :func:`~warmprior.evaluation.evaluate` refuses both.
 
     Args:
         chunk_length: ``H``.

@@ -16,7 +16,7 @@ from torchrl.envs.utils import make_composite_from_td
 from warmprior import keys
 from warmprior.checks import check_between, check_keys, check_whole_numbers
 from warmprior.history import advance, cold_history, history_keys, without
-from warmprior.transforms.inner_step import EnvTransform, check_unwritten, keep_resting
+from warmprior.transforms.inner_step import EnvTransform, check_real, check_unwritten, keep_resting
 
 
 class ActionHistory(EnvTransform):
@@ -33,6 +33,7 @@ class ActionHistory(EnvTransform):
     Raises:
         ValueError: if ``history_length < 1``.
         KeyError: if :class:`ChunkStep` does not precede it, or a step's input lacks the history.
+        TypeError: if the environment's actions are integers or flags.
 
     Examples:
         >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -88,8 +89,8 @@ class ActionHistory(EnvTransform):
         return observation_spec
 
     def _cold(self, chunk: TensorSpec, place: TensorDictBase | TensorSpec) -> TensorDictBase:
-        dtype = chunk.dtype if chunk.dtype.is_floating_point else torch.get_default_dtype()
-        lengths, like = (self.history_length, *chunk.shape[-2:]), {"dtype": dtype, "device": place.device}
+        lengths = self.history_length, *chunk.shape[-2:]
+        like = {"dtype": chunk.dtype, "device": place.device}
         return cold_history(place.shape, *lengths, **like)
 
     def _check_chunk(self) -> TensorSpec:
@@ -97,7 +98,9 @@ class ActionHistory(EnvTransform):
         hint = f" of the actions {list(actions.keys(True, True))}: append it after ChunkStep"
         check_keys(actions, self.in_keys, "ActionHistory", hint)
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
-        self._chunk = actions[self.in_keys[0]]
+        (key,) = self.in_keys
+        check_real(key, actions[key], "ChunkStep")
+        self._chunk = actions[key]
         return self._chunk
 
 

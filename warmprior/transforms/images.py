@@ -112,7 +112,7 @@ class EncodeObservation(EnvTransform):
     batched environments, because inside every worker would hold a copy of the encoder.
 
     Args:
-        actor: the policy; its network is copied, and not trained further.
+        actor: the policy; its network is copied as it is then, and not trained further.
 
     Raises:
         ValueError: if the network has no encoder (:attr:`VelocityNetwork.encodes`).

@@ -32,6 +32,16 @@ def check_unwritten(observation_spec: Any, names: Iterable[NestedKey], whose: st
         raise ValueError(f"{whose} would overwrite {taken}: give each in an environment its own keys")
 
 
+def check_real(key: NestedKey, action: TensorSpec, before: str) -> None:
+    """Raise TypeError for actions of whole numbers or flags, to which a policy's numbers would be cut."""
+    if not action.dtype.is_floating_point:  # of MultiDiscrete the width may differ as well
+        kind = f"{type(action).__name__} {list(action.shape)} of {action.dtype}"
+        raise TypeError(
+            f"the environment takes {kind} for {key}, and a policy writes real numbers: append a transform "
+            f"before {before} that rounds or encodes them"
+        )
+
+
 class EnvTransform(Transform):
     """A transform that treats resets like steps, and does nothing outside environments."""
 

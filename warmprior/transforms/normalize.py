@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
@@ -11,9 +14,38 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 from warmprior import keys
 from warmprior.checks import check_keys
 from warmprior.modules.normalize import Normalizer, check_width
+from warmprior.transforms.inner_step import check_real
 
 
-class FloatNorm(ObservationNorm):
+class FollowsNormalizer(Transform):
+    """A transform by the statistics of a normaliser, which takes them anew at every reset.
+
+    They are the normaliser's own tensors, until others take their place there: where a policy is moved or
+    cast, or its weights are loaded with ``assign=True``.
+    """
+
+    loc: Tensor
+    scale: Tensor
+    _source: tuple[Normalizer, NestedKey]
+
+    def following(self, normalizer: Normalizer, key: NestedKey) -> Self:
+        """Follow a normaliser, and return the transform."""
+        self._source = normalizer, key  # not as a part, which would move with the environment
+        return self
+
+    def follow(self) -> None:
+        """Take the normaliser's statistics."""
+        normalizer, key = self._source
+        for mine, theirs in ((self.loc, normalizer.loc(key)), (self.scale, normalizer.scale(key))):
+            if mine is not theirs:
+                mine.copy_(theirs)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self.follow()
+        return super()._reset(tensordict, tensordict_reset)
+
+
+class FloatNorm(FollowsNormalizer, ObservationNorm):
     """TorchRL's transform, for integers and flags too: its specs would keep their type, and buffers cut."""
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
@@ -33,7 +65,7 @@ class FloatNorm(ObservationNorm):
         return super().transform_observation_spec(observation_spec)
 
 
-class FloatScaling(ActionScaling):
+class FloatScaling(FollowsNormalizer, ActionScaling):
     """TorchRL's transform, in the precision of the actions and not in that of the statistics."""
 
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
@@ -44,12 +76,7 @@ class FloatScaling(ActionScaling):
         for key in self.in_keys_inv:
             if key in action_spec.keys(True, True):
                 leaf = action_spec[key]
-                if not leaf.dtype.is_floating_point:  # of MultiDiscrete the width may differ as well
-                    kind = f"{type(leaf).__name__} {list(leaf.shape)} of {leaf.dtype}"
-                    raise TypeError(
-                        f"the environment takes {kind} for {key}, and a policy writes real numbers: append a "
-                        "transform before the normaliser that rounds or encodes them"
-                    )
+                check_real(key, leaf, "the normaliser")
                 check_width(key, leaf.shape, self.loc)  # one number would fit any width
         return super().transform_action_spec(action_spec)
 
@@ -58,7 +85,8 @@ def normalizing_transforms(normalizer: Normalizer, action_key: NestedKey = keys.
     """Return TorchRL transforms that (de)normalise directly after the base environment.
 
     Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step. They share the
-    normaliser's statistics, and follow it where others are loaded into it.
+    normaliser's statistics, and follow it where others are loaded into it, from the next reset on. Workers in
+    other processes keep those of their start.
 
     Raises:
         TypeError: at the environment, if its actions are integers.
@@ -78,7 +106,9 @@ def normalizing_transforms(normalizer: Normalizer, action_key: NestedKey = keys.
     for key in normalizer.keys:
         loc, scale = normalizer.loc(key), normalizer.scale(key)
         if key == action_key:
-            transforms.append(FloatScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
+            scaling = FloatScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale)
+            transforms.append(scaling.following(normalizer, key))
         else:
-            transforms.append(FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
+            norm = FloatNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True)
+            transforms.append(norm.following(normalizer, key))
     return transforms

@@ -432,6 +432,7 @@ class RobomimicDemonstrations(Demonstrations):
                     expected["obs/object"] = task.object_dim
             lengths: list[int] = []
             shapes: dict[str, tuple[int, int]] = {}
+            common, present = set(available), set(available)
             for name in selected:
                 demo = member(file["data"], name, "group")
                 if demo is None:  # the name is listed, but a damaged index hides the demo
@@ -448,6 +449,8 @@ class RobomimicDemonstrations(Demonstrations):
                             f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. "
                             f"Use demos of one environment and controller{leave}."
                         )
+                held = names(demo["obs"])
+                common, present = common & {*held}, present | {*held}
                 expected, whose = widths, f"data/{selected[0]} of {env_args.get('env_name', path)}"
                 lengths.append(steps)
                 sizes = _image_shapes(demo, images, steps)
@@ -457,7 +460,8 @@ class RobomimicDemonstrations(Demonstrations):
                         "them again, or leave the demo out"
                     )
                 shapes = sizes
-            taken_by = {} if group is None else _options(group, set(available) - {*keys, *images})
+            # What some demos lack cannot be chosen.
+            taken_by = dict.fromkeys(present - common, "") | _options(group, common - {*keys, *images})
             if self.mask is None and self.demos is None:
                 _check_total(file, sum(lengths))
         return DatasetIndex(
@@ -467,7 +471,7 @@ class RobomimicDemonstrations(Demonstrations):
             observation_keys=keys,
             observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
             **self.pictured(images, shapes),
-            available_keys=available,
+            available_keys=tuple(sorted(present)),
             taken_by=taken_by,
             action_dim=widths["actions"],
             rewards="rewards" in widths,

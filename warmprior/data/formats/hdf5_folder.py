@@ -16,14 +16,22 @@ from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader, open_robomimic
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader, check_count
 from warmprior.data.steps import StoredActions, are_poses
+from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
+from warmprior.modules.recording import Recording
 
 EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards")
 """All files of a folder agree in these entries of their indices."""
 
+ENDINGS = (".hdf5", ".h5")
+"""The usual endings of HDF5 files, in any case."""
+
 
 class RobomimicFolder(Demonstrations):
-    """The demonstrations of all HDF5 files in a folder, in the order of the files' names."""
+    """The demonstrations of all HDF5 files in a folder, in the order of the files' names.
+
+    Those of folders below are not read; what is left out names them.
+    """
 
     prefix = ""
 
@@ -42,13 +50,35 @@ class RobomimicFolder(Demonstrations):
     @property
     def paths(self) -> list[Path]:
         """The files' paths, with any of the usual endings."""
-        return sorted(p for p in Path(self.place).iterdir() if p.suffix.lower() in (".hdf5", ".h5"))
+        return sorted(p for p in Path(self.place).iterdir() if p.suffix.lower() in ENDINGS)
+
+    @property
+    def others(self) -> list[str]:
+        """HDF5 files that are not read: those with another ending, and the folders with further ones."""
+        is_hdf5, found = require("h5py", "sim").is_hdf5, []
+        for path in sorted({*Path(self.place).iterdir()} - {*self.paths}):
+            below = sum(p.suffix.lower() in ENDINGS for p in path.rglob("*")) if path.is_dir() else 0
+            if below:
+                found.append(f"{path.name}/ with {below} file{'s' if below > 1 else ''}")
+            elif path.is_file() and is_hdf5(path):
+                found.append(path.name)
+        return found
 
     @override
     def check(self) -> None:
         if not self.paths:
+            elsewhere = f"; there are {', '.join(found)}" if (found := self.others) else ""
             other = f"a LeRobotDataset is lerobot:{self.place}"
-            raise FileNotFoundError(f"{self.place}: no file *.hdf5 or *.h5 in this folder; {other}")
+            raise FileNotFoundError(
+                f"{self.place}: no file *.hdf5 or *.h5 in this folder{elsewhere}; {other}"
+            )
+
+    @override
+    def recording(self, index: DatasetIndex, actions: str | None = None) -> Recording:
+        found, others = super().recording(index, actions), self.others
+        if not others:
+            return found
+        return replace(found, left_out={**found.left_out, "": [*found.left_out.get("", []), *others]})
 
     @override
     def index(
@@ -62,6 +92,11 @@ class RobomimicFolder(Demonstrations):
                     f"{other.path}: {name} differ from those of {first.path}{values}: keep recordings of one "
                     "environment and robot in a folder, or choose observations that all have"
                 )
+        present = sorted({key for index in indices for key in index.available_keys})
+        options = {
+            key: {i.taken_by.get(key, "observations") if key in i.available_keys else "" for i in indices}
+            for key in present
+        }
         demos = [f"{index.path.name}/{demo}" for index in indices for demo in index.demos]
         lengths = [length for index in indices for length in index.lengths]
         check_count(Path(self.place), self.demos, len(demos))
@@ -70,6 +105,9 @@ class RobomimicFolder(Demonstrations):
             path=Path(self.place),
             demos=tuple(demos[: self.demos]),
             lengths=tuple(lengths[: self.demos]),
+            available_keys=tuple(present),
+            # What some files lack cannot be chosen.
+            taken_by={key: found.pop() if len(found) == 1 else "" for key, found in options.items()},
             whole=self.demos in (None, len(demos)),
         )
 

@@ -230,7 +230,9 @@ class LeRobotDemonstrations(Demonstrations):
 
     def contents(self, index: DatasetIndex) -> str:
         """Return the digest of the files of the selected episodes, numbers and images, alone."""
-        return self.fetched(index).digest()
+        here = self.fetched(index)
+        with reading(f"{here.path}: its files", _AGAIN):
+            return here.digest()
 
     @override
     def origin(self, index: DatasetIndex) -> tuple[dict[str, Any] | None, np.ndarray | None]:

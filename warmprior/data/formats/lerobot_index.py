@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import accumulate, pairwise, product
 from pathlib import Path
@@ -208,6 +208,19 @@ def _check_columns(root: Path, metadata: Any, names: Sequence[str]) -> None:
             )
 
 
+def _check_frames(root: Path, metadata: Any, video: str, chosen: Set[int]) -> None:
+    """Raise DatasetError if one of the chosen episodes has frames of a video that are another's as well."""
+    names = [f"videos/{video}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
+    with reading(f"{root}: {names[-1]} of meta/episodes", "Download or convert it again."):
+        columns = (metadata.episodes[name] for name in (*names, "length", "episode_index"))
+        places = sorted(zip(*columns, strict=True))
+        for (*file, start, length, number), (*following, begin, _, other) in pairwise(places):
+            # A video may lack its last frame.
+            same = file == following and begin < start + max(length - 1.5, 0.5) / metadata.fps
+            if same and not chosen.isdisjoint((number, other)):
+                raise ValueError(f"the frames of the episodes {number} and {other} overlap in {video}")
+
+
 def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
     """Check episode numbers, and return them sorted and without repetition."""
     if any(type(number) is not int or not 0 <= number < count for number in numbers):
@@ -336,6 +349,8 @@ def read_lerobot_index(
     )
     parts = product(index.videos, ("chunk", "file"))
     _check_columns(root, metadata, [f"videos/{name}/{part}_index" for name, part in parts])
+    for name in index.videos:
+        _check_frames(root, metadata, name, {row["episode_index"] for row in rows})
     return index
 
 

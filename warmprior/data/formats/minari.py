@@ -33,6 +33,9 @@ from warmprior.io.files import check_regular_files, digest_of, file_digest, read
 
 _AGAIN = "Download it again."
 
+FORMATS = ("hdf5", "parquet", "arrow")
+"""Minari's forms of files that are checked and read here."""
+
 SUCCESS_NAMES = ("success", "is_success")
 """The names of success in the ``info`` of Gymnasium's environments."""
 
@@ -68,7 +71,19 @@ def _parsed(name: str | Path, folder: Path, metadata: bytes) -> Any:
 def _check_files(folder: Path) -> None:
     """Raise an error for files that cannot be opened, and if the metadata count other episodes."""
     check_regular_files(folder)
+    metadata = read_json(folder / "metadata.json")
+    if (form := metadata["data_format"]) not in FORMATS:
+        raise DatasetError(
+            f"{folder}: metadata.json has data_format={str(form)[:80]!r}, but those known here are "
+            f"{', '.join(FORMATS)}: convert it to one of them with Minari"
+        )
     episodes = [path.name for path in folder.iterdir() if path.is_dir()]
+    for episode in episodes if form != "hdf5" else ():
+        files = sorted(path.name for path in (folder / episode).iterdir())
+        parts = [file for file in files if file[0] not in "_." and file != "metadata.json"]
+        if len(parts) != 1:  # Minari reads one of them
+            what = f"{len(parts)} files of steps, not 1 ({', '.join(parts)})"
+            raise DatasetError(f"{folder / episode} has {what}. {_AGAIN}")
     if (data := folder / "main_data.hdf5").exists():
         with open_hdf5(data) as file:
             episodes = names(file)
@@ -76,7 +91,7 @@ def _check_files(folder: Path) -> None:
                 if (group := member(file, episode, "group")) is not None:
                     with reading(f"{data}: the metadata of {episode}", _AGAIN):
                         dict(group.attrs)  # which checks their heaps
-    count = read_json(folder / "metadata.json")["total_episodes"]
+    count = metadata["total_episodes"]
     if count != len(episodes):
         raise DatasetError(f"{folder}: metadata.json counts {count} episodes, not {len(episodes)}. {_AGAIN}")
 
