@@ -187,12 +187,12 @@ def arm(root, names=JOINTS, near=0.05):
 
     features = {"observation.state": numbers(6, JOINTS), "action": numbers(6, names)}
     values = write_lerobot(root, (30, 30), features, fps=30)
-    targets = 40 * (values["observation.state"] + near * values["action"])
-    edit_table(root / "data/chunk-000/file-000.parquet", action=lambda _: list(targets.astype(np.float32)))
-    scaled = 40 * values["observation.state"]
+    joints = 40 * values["observation.state"]
+    targets = joints + 40 * near * values["action"]
     edit_table(
         root / "data/chunk-000/file-000.parquet",
-        observation__state=lambda _: list(scaled.astype(np.float32)),
+        action=lambda _: list(targets.astype(np.float32)),
+        observation__state=lambda _: list(joints.astype(np.float32)),
     )
     return f"lerobot:{root}"
 
