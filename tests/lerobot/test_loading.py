@@ -42,7 +42,14 @@ def whole(found, tmp_path_factory):
 
 @pytest.fixture
 def saved(whole, tmp_path):
-    return lambda name: shutil.copytree(whole(name), tmp_path, dirs_exist_ok=True)
+    """Copy such a policy, with other entries in its configuration."""
+
+    def copied(name, **changed):
+        shutil.copytree(whole(name), tmp_path, dirs_exist_ok=True)
+        path = tmp_path / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changed))
+
+    return copied
 
 
 def edit(folder, change):
@@ -108,35 +115,27 @@ def test_damaged_weights_are_named(found, saved, tmp_path):
     ],
 )
 def test_a_configuration_of_which_nothing_can_be_built(found, saved, tmp_path, option, value):
-    saved("warm_flow")
-    config = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(config | {option: value}))
+    saved("warm_flow", **{option: value})
     refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "cannot be built")
 
 
 @pytest.mark.parametrize("option", ["sigma_unit", "cold_probability"])
 def test_null_for_an_option_of_the_source(found, saved, option, tmp_path):
-    saved("warm_smolvla")
-    config = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(config | {option: None}))
+    saved("warm_smolvla", **{option: None})
     refuses(lambda: load(found, "warm_smolvla", tmp_path), ValueError, tmp_path, f"--policy.{option} needs")
 
 
 def test_weights_of_another_size_are_named_in_one_line(found, saved, tmp_path):
     """As where a configuration lost an option, whose default is another."""
-    saved("warm_flow")
-    config = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(config | {"embedding_dim": 48}))
+    saved("warm_flow", embedding_dim=48)
     with raises(ValueError, tmp_path, "size mismatch", "action_position", "...") as refused:
         load(found, "warm_flow", tmp_path)
     assert "\n" not in str(refused.value)
 
 
 def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, saved, tmp_path):
-    saved("warm_flow")
-    config = json.loads((tmp_path / "config.json").read_text())
     for width in (24_000, 960_000):  # gigabytes, and terabytes
-        (tmp_path / "config.json").write_text(json.dumps(config | {"embedding_dim": width, "network": ""}))
+        saved("warm_flow", embedding_dim=width, network="")
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "far more weights")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
@@ -183,9 +182,7 @@ def test_options_that_contradict_the_saved_ones(found, saved, name, tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("prior", ["evil_module:Prior", "evil_module", "evil_module:Prior,sigma=0.1"])
 def test_a_prior_in_a_file_imports_nothing(found, saved, name, prior, tmp_path, monkeypatch):
-    saved(name)
-    content = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(content | {"prior": prior}))
+    saved(name, prior=prior)
     (tmp_path / "evil_module.py").write_text("raise SystemExit('ran')")
     monkeypatch.syspath_prepend(tmp_path)
     with raises(ValueError, "'evil_module", "--policy.discover_packages_path"):

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from tests.errors import raises, refuses
 from tests.toy_env import mlp_actor, stirred
-from warmprior import PastPrior, PreviewPrior, PriorDecoder, RealTimeChunking
+from warmprior import PastPrior, PreviewPrior, RealTimeChunking
 from warmprior.history import advance, cold_history, without
 from warmprior.modules.real_time_chunking import spliced
 
@@ -244,12 +244,10 @@ def test_the_deviation_of_a_source_may_be_a_number():
     assert torch.equal(one["vla_action", "chunk"], other["vla_action", "chunk"])
 
 
-def test_missing_keys_and_decoders():
+def test_missing_keys():
     data = decision(PastPrior(4), 2).exclude("rtc")
     with raises(KeyError, "InferenceDelay", "AsyncExecutor"):
         actor(PastPrior(4), guidance=RealTimeChunking())(data)
-    with raises(ValueError, "replace(guidance=None)"):
-        PriorDecoder(actor(PastPrior(4), guidance=RealTimeChunking()), delta=0.5)
 
 
 def test_what_is_executed_of_a_late_chunk():

@@ -168,7 +168,6 @@ def test_the_policy_before_stays_as_it_is():
     ("change", "agent", "words"),
     [
         ({"guidance": RealTimeChunking(horizon=2)}, {}, ["guidance=None"]),
-        ({"max_nfe": 1, "nfe": 1}, {}, ["t = 0"]),
         ({}, {"in_keys": [keys.OBSERVATION, "goal"]}, ["goal", "anchor"]),
     ],
 )

@@ -74,16 +74,16 @@ def test_an_image_that_is_not_there_is_named_beside_those_that_are(tmp_path):
 
 
 def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
-    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=4, resize="pad")
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), image_size=8, resize="pad")
     task = Task(demonstrations, observations=["robot0_ft", "force"], images=["wrist"])
     recording = task.recording
     assert list(recording.observations.items()) == [("robot0_ft", 6), ("force", 1)]
     assert recording.left_out["observations"] == ["robot0_eef_pos", "robot0_gripper_qpos"]
-    assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "4 x 4")
+    assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "8 x 8")
     assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
 
 
-@pytest.mark.parametrize("options", [{"image_size": 4}, {"resize": "pad"}])
+@pytest.mark.parametrize("options", [{"image_size": 8}, {"resize": "pad"}])
 def test_a_size_of_images_without_images_is_refused(tmp_path, options):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), **options)
     refuses(lambda: Task(demonstrations), ValueError, "image_size and resize", "images")
@@ -187,12 +187,12 @@ def arm(root, names=JOINTS, near=0.05):
 
     features = {"observation.state": numbers(6, JOINTS), "action": numbers(6, names)}
     values = write_lerobot(root, (30, 30), features, fps=30)
-    targets = 40 * (values["observation.state"] + near * values["action"])
-    edit_table(root / "data/chunk-000/file-000.parquet", action=lambda _: list(targets.astype(np.float32)))
-    scaled = 40 * values["observation.state"]
+    joints = 40 * values["observation.state"]
+    targets = joints + 40 * near * values["action"]
     edit_table(
         root / "data/chunk-000/file-000.parquet",
-        observation__state=lambda _: list(scaled.astype(np.float32)),
+        action=lambda _: list(targets.astype(np.float32)),
+        observation__state=lambda _: list(joints.astype(np.float32)),
     )
     return f"lerobot:{root}"
 

@@ -92,7 +92,9 @@ def cached_images(
     path = cache_folder() / "images" / f"{identity}.bytes"
 
     def write(temporary: Path) -> None:
-        _write(temporary, index, reader, key)
+        out = MemoryMappedTensor.empty(shape, dtype=torch.uint8, filename=str(temporary))
+        reserve(out)
+        read_images(index, reader, key, out)
         if contents() != digest:
             raise DatasetError(f"{index.path} changed while it was read: read it again")
         temporary.chmod(COMPLETE)
@@ -138,12 +140,6 @@ def _is_complete(path: Path, shape: Sequence[int]) -> bool:
     except OSError:
         return False
     return (stat.S_IMODE(found.st_mode), found.st_size) == (COMPLETE, torch.Size(shape).numel())
-
-
-def _write(path: Path, index: DatasetIndex, reader: DemonstrationReader, key: str) -> None:
-    out = MemoryMappedTensor.empty(image_shape(index), dtype=torch.uint8, filename=str(path))
-    reserve(out)
-    read_images(index, reader, key, out)
 
 
 def _clean(folder: Path) -> None:

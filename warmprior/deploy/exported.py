@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 from warmprior import keys
 from warmprior.checks import check_keys, check_shape
 from warmprior.deploy.observation import observation_shapes
-from warmprior.history import advance, cold_history
+from warmprior.history import ENTRIES, advance, cold_history, history_keys
 from warmprior.io.files import check_regular, file_digest, read_json, write_atomic
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor, check_usual_keys
@@ -38,8 +38,6 @@ FIELDS = {
     *("observation_key", "observation_steps", "action_dim", "shapes", "normalizer", "recording"),
 }
 """The entries that the description of an exported policy holds."""
-
-HISTORY_ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 
 
 class _Draws(TorchFunctionMode):
@@ -66,9 +64,9 @@ class _Decision(nn.Module):
         self.policy = policy
 
     def forward(self, observation: Tensor, *others: Tensor) -> Tensor:
-        history = TensorDict(dict(zip(HISTORY_ENTRIES, others, strict=False)))
+        history = TensorDict(dict(zip(ENTRIES, others, strict=False)))
         data = TensorDict({self.policy.observation_key: observation, keys.HISTORY: history})
-        with _Draws(others[len(HISTORY_ENTRIES) :]):
+        with _Draws(others[len(ENTRIES) :]):
             return self.policy(data)[keys.CHUNK]
 
 
@@ -141,7 +139,7 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
         chunk = torch.randn(history["forecast"].shape, dtype=dtype)
         later = advance(history, chunk, torch.tensor([prior.chunk_length]))
         observation = torch.randn(network.observation_steps, network.observation_dim, dtype=dtype)
-        cases = [(observation, *(state[name] for name in HISTORY_ENTRIES)) for state in (history, later)]
+        cases = [(observation, *(state[name] for name in ENTRIES)) for state in (history, later)]
         with _Draws() as noted:
             fixed(TensorDict({fixed.observation_key: observation, keys.HISTORY: history}))
         draws = [torch.randn(shape, dtype=kind) for shape, kind in noted.drawn]
@@ -209,11 +207,9 @@ def load_exported(path: str | Path) -> ExportedPolicy:
     check_regular(path)
     description = read_json(path.with_suffix(".json"))
     program = path.read_bytes()
-    if not isinstance(description, dict) or (lacking := FIELDS - description.keys()):
-        lacks = (
-            f"lacks {', '.join(sorted(lacking))}" if isinstance(description, dict) else "is no description"
-        )
-        raise ValueError(f"{path.with_suffix('.json')} {lacks}: export the policy again")
+    if lacking := FIELDS - (description.keys() if isinstance(description, dict) else set()):
+        lacks = ", ".join(sorted(lacking))
+        raise ValueError(f"{path.with_suffix('.json')} lacks {lacks}: export the policy again")
     if description["program"] != hashlib.sha256(program).hexdigest():
         raise ValueError(
             f"{path} is not the program that {path.with_suffix('.json')} describes: export again"
@@ -252,7 +248,7 @@ class ExportedPolicy(Drawing, TensorDictModuleBase):
         self.device = torch.device("cpu")
         key = description["observation_key"]
         self.observation_key = tuple(key) if isinstance(key, list) else key
-        self.in_keys = [self.observation_key, *((keys.HISTORY, name) for name in HISTORY_ENTRIES)]
+        self.in_keys = [self.observation_key, *history_keys()]
         self.out_keys = [keys.CHUNK]
         self._inputs = [(tuple(shape), getattr(torch, kind[6:])) for shape, kind in description["inputs"]]
         self.recording = description["recording"] and Recording(**description["recording"])

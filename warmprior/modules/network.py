@@ -119,8 +119,7 @@ def velocity_field(
     The observations, ``[B, To, *]`` or a tensordict, are encoded once. The network computes in its own dtype;
     the path is integrated, and its error measured, in that of the actions.
     """
-    dtype = precision_of(network)
-    encoding = _encoded(network, observation, dtype)
+    dtype, encoding = precision_of(network), encoded(network, observation)
     if dtype is None:
         return lambda t, a: network(t, a, encoding)
     return lambda t, a: network(t.to(dtype), a.to(dtype), encoding).to(a.dtype)
@@ -128,11 +127,7 @@ def velocity_field(
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
     """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
-    return _encoded(network, observation, precision_of(network))
-
-
-def _encoded(network: nn.Module, observation: Any, dtype: torch.dtype | None) -> Any:
-    encodes = getattr(network, "encodes", False)
+    dtype, encodes = precision_of(network), getattr(network, "encodes", False)
 
     def cast(value: Tensor) -> Tensor:
         # Vectors [B, To, d] may be integers or flags; what is encoded, such as images, stays as it is.

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from warmprior import keys
 from warmprior.checks import (
+    check_choice,
     check_keys,
     check_not_negative,
     check_positive,
@@ -58,17 +59,14 @@ def _jump(grid: str) -> float | None:
     if grid == "uniform":
         return None
     name, colon, number = str(grid).partition(":")
-    if name != "dense-jump":
-        raise ValueError(
-            f"unknown grid {grid!r}; choose one of uniform, dense-jump, or dense-jump:TIME with a time in "
-            "(0, 1)"
-        )
     try:
         share = float(number) if colon else JUMP
     except ValueError:
         share = float("nan")
-    if not 0.0 < share < 1.0:
-        raise ValueError(f"the jump of a grid must start in (0, 1), got {grid!r}")
+    if name != "dense-jump" or not 0.0 < share < 1.0:
+        raise ValueError(
+            f"grid must be uniform, dense-jump, or dense-jump:TIME with a time in (0, 1), got {grid!r}"
+        )
     return share
 
 
@@ -87,8 +85,7 @@ Solver = Literal["euler", "midpoint", "heun", "rk4"]
 
 
 def _steps(nfe: int, solver: str) -> int:
-    if solver not in SOLVERS:
-        raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
+    check_choice("solver", solver, SOLVERS)
     stages = len(SOLVERS[solver][0])
     if not isinstance(nfe, Integral) or not 0 < nfe <= MAX_NFE or nfe % stages:
         raise ValueError(
@@ -191,6 +188,7 @@ class Sampling:
 
     def __post_init__(self) -> None:
         check_whole_numbers(**given(nfe=self.nfe, max_nfe=self.max_nfe))
+        check_choice("solver", self.solver, SOLVERS)
         self.evaluations()
         _jump(self.grid)  # raises at an unknown grid
         if isinstance(self.clip, Sequence):
@@ -208,9 +206,8 @@ class Sampling:
         nfe = self.nfe if nfe is None else nfe
         if nfe is None:
             nfe = DEFAULT_NFE if self.max_nfe is None else min(DEFAULT_NFE, self.max_nfe)
-            if self.solver in SOLVERS:  # rounded down to a multiple of the stages
-                stages = len(SOLVERS[self.solver][0])
-                nfe = max(nfe - nfe % stages, stages)
+            stages = len(SOLVERS[self.solver][0])  # the default is rounded down to a multiple of these
+            nfe = max(nfe - nfe % stages, stages)
         _steps(nfe, self.solver)
         if self.max_nfe is not None and nfe > self.max_nfe:
             raise ValueError(

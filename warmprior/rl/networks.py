@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -14,7 +15,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.checks import check_distinct, check_positive, check_whole_numbers
+from warmprior.checks import check_distinct, check_positive, check_whole_numbers, given
 from warmprior.rl.anchor import length_of_residuals
 
 
@@ -62,26 +63,24 @@ class BoxTanhNormal(TanhNormal):
 LOG_STD_RANGE = (-20.0, 2.0)
 
 
+@dataclass
 class _Sizes:
-    """The shapes that an agent's networks read and write: observation, chunk and residual."""
+    """The sizes of what an agent's networks read and write: observation, chunk and residual."""
 
-    def __init__(
-        self,
-        action_dim: int,
-        observation_dim: int,
-        prediction_length: int,
-        observation_steps: int,
-        residual_length: int | None,
-    ) -> None:
-        check_whole_numbers(
-            action_dim=action_dim,
-            observation_dim=observation_dim,
-            prediction_length=prediction_length,
-            observation_steps=observation_steps,
-        )
-        length = length_of_residuals(residual_length, prediction_length)
-        self.observation = (observation_steps, observation_dim)
-        self.chunk, self.residual = (prediction_length, action_dim), (length, action_dim)
+    action_dim: int
+    observation_dim: int
+    prediction_length: int
+    observation_steps: int
+    residual_length: int | None
+
+    def __post_init__(self) -> None:
+        check_whole_numbers(**given(**vars(self)))
+        self.residual_length = length_of_residuals(self.residual_length, self.prediction_length)
+
+    @property
+    def residual(self) -> tuple[int, int]:
+        """The shape of a residual, ``(R, d_a)``."""
+        return cast(int, self.residual_length), self.action_dim
 
 
 class _Trunk(nn.Module):
@@ -101,8 +100,8 @@ class _Trunk(nn.Module):
         check_distinct("in_keys", [str(key) for key in in_keys])
         names = [unravel_key(key) for key in in_keys]
         self.scales = [scales.get(name, 1.0) for name in names]
-        chunks = sum(math.prod(sizes.residual if name == keys.DELTA else sizes.chunk) for name in names[1:])
-        self.in_features = math.prod(sizes.observation) + chunks
+        lengths = [sizes.residual[0] if name == keys.DELTA else sizes.prediction_length for name in names[1:]]
+        self.in_features = sizes.observation_steps * sizes.observation_dim + sum(lengths) * sizes.action_dim
         norm: dict[str, Any] = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": hidden_dim}}
         # Its activation is Tanh.
         self.net = MLP(self.in_features, out_features, depth=num_layers, num_cells=hidden_dim, **norm)
@@ -193,17 +192,8 @@ def make_prior_space_actor(
         return_log_prob=True,
     )
     # For improved_policy, which builds it again.
-    actor.options = {
-        "action_dim": action_dim,
-        "observation_dim": observation_dim,
-        "prediction_length": prediction_length,
-        "observation_steps": observation_steps,
-        "delta": delta,
-        "residual_length": residual[0],
-        "hidden_dim": hidden_dim,
-        "num_layers": num_layers,
-        "in_keys": list(in_keys),
-    }
+    own = {"delta": delta, "hidden_dim": hidden_dim, "num_layers": num_layers, "in_keys": list(in_keys)}
+    actor.options = {**vars(sizes), **own}
     return actor
 
 

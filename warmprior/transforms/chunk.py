@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -48,16 +48,8 @@ def check_measures(measures: Measures) -> None:
         check_choice(f"the measure {key!r}", how, get_args(How))
 
 
-_REACH: dict[type[Transform], Callable[[Any], int]] = {
-    AbsoluteActions: lambda transform: 1,
-    ActionScaling: lambda transform: 1,
-    CameraImages: lambda transform: 1,
-    FloatNorm: lambda transform: 1,
-    FloatScaling: lambda transform: 1,
-    ObservationNorm: lambda transform: 1,
-    ObservationStack: lambda transform: transform.steps,
-}
-"""The number of last observations that the output of a transform without memory depends on, by type."""
+_PER_STEP = {AbsoluteActions, ActionScaling, CameraImages, FloatNorm, FloatScaling, ObservationNorm}
+"""The transforms whose output depends on the last step alone; a stack's depends on all that it holds."""
 
 _REFUSED: dict[type[Transform], str] = {
     ActionDiscretizer: "whose actions are indices, and those of chunks numbers: leave it out",
@@ -104,7 +96,8 @@ class LateTransforms:
     def __init__(self, step: InnerStep, action_key: NestedKey) -> None:
         self._step, self._action_key = step, action_key
         self._transforms = step.transforms
-        self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
+        stacks = (t for t in self._transforms if isinstance(t, ObservationStack))
+        self._reach = 1 + sum(stack.steps - 1 for stack in stacks)
         # Actions are inverted from the last transform to the first.
         self._inverse = [t for t in reversed(self._transforms) if t.in_keys_inv]
 
@@ -119,7 +112,7 @@ class LateTransforms:
         # entries that these transforms write.
         if others or isinstance(action_key, tuple) or isinstance(base, TransformedEnv):
             return None
-        if any(type(transform) not in _REACH for transform in transforms):
+        if not {type(transform) for transform in transforms} <= {*_PER_STEP, ObservationStack}:
             return None
         # An environment reads only its action and states: other observations may reach it untransformed.
         written = _roots(key for t in transforms for key in t.out_keys)

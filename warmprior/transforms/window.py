@@ -320,8 +320,6 @@ class _WindowStorage(TensorStorage):
     def get(self, index: Any) -> TensorDictBase:
         """Return the windows of some steps."""
         frame = self.frames[index]
-        if frame.ndim == 1:
-            return self.window._windows(frame)
         return self.window._windows(frame.reshape(-1)).reshape(frame.shape)
 
 

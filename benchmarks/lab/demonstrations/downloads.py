@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from warmprior.checks import check_choice
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
@@ -59,12 +60,9 @@ def download_robomimic(
     from warmprior.envs.mimicgen import is_mimicgen
     from warmprior.envs.robosuite_tasks import TASKS
 
-    official = OFFICIAL
-    if task not in official:
-        raise ValueError(f"no official data for task {task!r}; choose one of {', '.join(official)}")
-    style = official[task][0] if style is None else style
-    if style not in official[task]:
-        raise ValueError(f"{task} has no official {style!r} data; it has: {', '.join(official[task])}")
+    check_choice("the task of official data", task, OFFICIAL)
+    style = OFFICIAL[task][0] if style is None else style
+    check_choice(f"the style of official data of {task}", style, OFFICIAL[task])
     if not is_mimicgen(TASKS[task].env_name):
         return _download(f"v1.5/{task}/{style}/low_dim_v15.hdf5", REPOSITORIES, root, force)
     # Human demonstrations are published per task, generated ones per variant of a task.

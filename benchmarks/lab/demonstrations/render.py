@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lab.io.workers import available_cores, working
+from warmprior.checks import check_distinct, check_whole_numbers, given
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
 from warmprior.data.images import StateRenderer, renderer_versions
 from warmprior.data.index import DatasetError, DatasetIndex
@@ -76,11 +77,8 @@ def render_demonstrations(
     if cameras is None:
         cameras = index.task.cameras if index.task else ("agentview", "robot0_eye_in_hand")
     cameras = tuple(cameras)
-    if not cameras or len(set(cameras)) < len(cameras):
-        raise ValueError(f"name different cameras to render, got {list(cameras)}")
-    for name, value in {"size": size, "workers": workers}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    check_distinct("cameras to render", cameras)
+    check_whole_numbers(size=size, **given(workers=workers))
     needed, free = 3 * size**2 * max(index.lengths) * len(cameras), available_memory()
     if needed > free:
         raise ValueError(

@@ -16,6 +16,7 @@ from lab.demonstrations.data_options import DataOptions, is_simulated
 from lab.demonstrations.downloads import OFFICIAL, download_robomimic
 from lab.demonstrations.render import render_demonstrations
 from lab.demonstrations.scripted.generate import generate_demonstrations
+from warmprior.checks import check_choice
 from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.images import check_images, renderer_versions
@@ -146,8 +147,7 @@ def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
         >>> task.name, task.make_env(batch_size=[8]).batch_size
         ('navigation', torch.Size([8]))
     """
-    if style not in ("toy", "position"):
-        raise ValueError(f"the style of the toy is 'toy' or 'position', got {style!r}")
+    check_choice("style", style, ("toy", "position"))
     octaves = 0 if style == "position" else OCTAVES
     make_env = partial(NavigationEnv, octaves=octaves)
     steps = navigation_demonstrations(octaves)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from warmprior import LinearInterpolant, OTCoupling
-from warmprior.checks import check_finite_numbers
+from warmprior.checks import check_positive
 from warmprior.modules.interpolant import Interpolant
 
 
@@ -42,9 +42,7 @@ class BridgeInterpolant(Interpolant):
     name = "bridge"
 
     def __init__(self, sigma: float) -> None:
-        check_finite_numbers(sigma=sigma)
-        if sigma <= 0:
-            raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
+        check_positive(sigma=sigma)
         self.sigma = float(sigma)
 
     coefficients = LinearInterpolant.coefficients

@@ -22,6 +22,7 @@ from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
 from warmprior.options.evaluation import DEFAULT_NFE
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS
+from warmprior.options.training import Encoder
 from warmprior.training import warmup_cosine
 from warmprior.training.option_text import build
 
@@ -149,8 +150,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def joint_columns(self, key: str) -> list[int]:
         """Return for each action the column of the observation, within ``key``, that it sets, or -1."""
-        if key not in self.observed:
-            raise ValueError(f"--policy.joints must be one of {', '.join(self.observed)}, got {key!r}")
+        check_choice("--policy.joints", key, self.observed)
         widths = [self.input_features[name].shape[0] for name in self.observed]
         first, width = sum(widths[: self.observed.index(key)]), widths[self.observed.index(key)]
         return [first + i if i < width else -1 for i in range(self.action_feature.shape[0])]
@@ -158,9 +158,7 @@ class WarmFlowConfig(PreTrainedConfig):
     def validate_features(self) -> None:
         """Raise ValueError for a dataset that the policy cannot learn from."""
         check_given(type(self), self)
-        encoders = ("resnet18-imagenet", "resnet18", "small")
-        if self.encoder not in encoders:
-            raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")
+        check_choice("--policy.encoder", self.encoder, get_args(Encoder))
         check_choice("--policy.resize", self.resize, get_args(Resize))
         mode = self.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
         if self.image_features and mode != NormalizationMode.IDENTITY:

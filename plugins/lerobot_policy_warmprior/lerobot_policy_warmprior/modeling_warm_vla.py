@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
+from warmprior.checks import check_choice
 from warmprior.lerobot import WarmPriorAdapter, action_std
 from warmprior.lerobot.adapter import LEFT_OVER
 
@@ -37,8 +38,7 @@ class WarmPolicyMixin(WholePolicy):
         if dataset_meta is not None:
             check_statistics(config, dataset_meta)
         super().__init__(config)
-        if config.sigma_unit not in ("model", "std"):
-            raise ValueError(f"sigma_unit must be 'model' or 'std', got {config.sigma_unit!r}")
+        check_choice("sigma_unit", config.sigma_unit, ("model", "std"))
         if config.sigma_unit == "std" and (config.action_std is None or dataset_meta is not None):
             config.action_std = action_std(self, dataset_stats).tolist()
         std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None

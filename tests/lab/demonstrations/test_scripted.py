@@ -135,7 +135,7 @@ def in_threads(count, state):
         ({"task": "tool_hang"}, ("'tool_hang'", "download_robomimic")),
         ({"style": "mg"}, ("style", "'mg'")),
         ({"seed": 100}, ("seed", 99, 100)),
-        ({"n": 10**23}, ("n", "100,000")),
+        ({"n": 100_001}, ("n", 100_000)),
     ],
 )
 def test_bad_arguments(options, facts, tmp_path, monkeypatch):

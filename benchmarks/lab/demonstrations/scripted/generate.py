@@ -22,6 +22,7 @@ from lab.demonstrations.scripted.episode import (
 from lab.demonstrations.scripted.operators import OPERATORS
 from lab.demonstrations.scripted.tasks import EXPERTS
 from lab.io.workers import available_cores, working
+from warmprior.checks import check_between, check_choice, check_whole_numbers, given
 from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import import_robosuite, task_env_args
@@ -86,16 +87,10 @@ def generate_demonstrations(
             f"there is no scripted expert for {task!r}; only its official data exist: fetch them "
             "(download_robomimic, or --download)"
         )
-    if style not in _STYLES:
-        raise ValueError(f"style is {' or '.join(map(repr, _STYLES))}, got {style!r}")
-    last_seed = EVALUATION_SEED // SEEDS_PER_FILE - 1
-    if not 0 <= seed <= last_seed:
-        raise ValueError(f"seed must be between 0 and {last_seed}, got {seed}")
-    for name, value in {"n": n, "workers": workers}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    if n > SEEDS_PER_FILE:
-        raise ValueError(f"n must be at most {SEEDS_PER_FILE:,}, the seeds of a file, got {n}")
+    check_choice("style", style, _STYLES)
+    check_between(0, EVALUATION_SEED // SEEDS_PER_FILE - 1, seed=seed)
+    check_whole_numbers(n=n, **given(workers=workers))
+    check_between(1, SEEDS_PER_FILE, n=n)
     if path is None:
         name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
         path = cache_folder() / "scripted" / name
