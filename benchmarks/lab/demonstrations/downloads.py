@@ -55,7 +55,7 @@ def download_robomimic(
         >>> download_robomimic("tool_hang", "mh")
         Traceback (most recent call last):
             ...
-        ValueError: tool_hang has no official 'mh' data; it has: ph
+        ValueError: the style of official data of tool_hang must be one of ph, got 'mh'
     """
     from warmprior.envs.mimicgen import is_mimicgen
     from warmprior.envs.robosuite_tasks import TASKS
