@@ -151,18 +151,36 @@ def test_files_with_other_usual_endings_are_read_too(sessions):
 
 def test_what_is_not_read_of_a_folder_is_left_out_by_name(sessions, tmp_path, capsys):
     folder, _ = sessions
-    for name in ("old/monday.hdf5", "old/older/sunday.H5", "spare/friday.hdf5"):
+    for name in ("old/monday.hdf5", "old/sunday.H5", "spare/friday.hdf5"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(folder / "friday.hdf5", folder / name)
     (folder / "empty").mkdir()
     shutil.copy(folder / "friday.hdf5", folder / "friday.backup")
     os.mkfifo(folder / "pipe")
+    (folder / "loop").symlink_to(folder)
+    (folder / "notes").symlink_to("/nowhere")
     place, others = open_demonstrations(folder), ["friday.backup", "old/ with 2 files", "spare/ with 1 file"]
     assert place.recording(place.index()).left_out[""] == others
     assert Task(place).recording.left_out[""] == others
     words = f"train {folder} --iterations 1 --hidden-dim 8 --out {tmp_path}"
     assert main(words.split()) == 0
     assert not missing(capsys.readouterr().out, *others)
+    for number in range(8):
+        shutil.copy(folder / "friday.hdf5", folder / f"friday{number}.backup")
+    named = place.recording(place.index()).left_out[""]
+    assert len(named) == 6 and named[-1] == "6 more"
+
+
+def test_what_may_not_be_looked_at_is_not_needed(sessions, monkeypatch):
+    folder, _ = sessions
+    (folder / "secret").touch()
+
+    def forbidden(path):
+        raise PermissionError(path)
+
+    monkeypatch.setattr(h5py, "is_hdf5", forbidden)
+    place = open_demonstrations(folder)
+    assert "" not in place.recording(place.index()).left_out
 
 
 def test_a_folder_of_folders_names_them(sessions, capsys):

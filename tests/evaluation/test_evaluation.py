@@ -417,15 +417,15 @@ def test_policy_and_environment_need_one_normaliser():
     for wrong in (None, other):
         with raises(ValueError, "normalizer=policy.normalizer"):
             play(wrong)
-    # An agent's decoder has a copy of the policy, and the environment the policy's own statistics.
-    env = TransformedEnv(SeededEnv(), Compose(*policy_transforms(actor), PriorAnchor(actor)))
-    decoder = PriorDecoder(actor, delta=0.5)
-    agent = TensorDictSequential(ResidualSampler(decoder), decoder)
-    assert evaluate(agent, env, episodes=1, first_seed=0)[0].steps == length_of(0)
+    # An environment follows the policy.
+    env = TransformedEnv(SeededEnv(), policy_transforms(actor))
     mine.load_state_dict(other.state_dict(), assign=True)
     assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
-    with raises(ValueError, "normalizer=policy.normalizer"):
-        evaluate(agent, env, episodes=1, first_seed=0)
+    # A network's own normaliser is no policy's.
+    plain = actor.replace(normalizer=None)
+    plain.network.normalizer = mine
+    env = TransformedEnv(SeededEnv(), policy_transforms(PRIOR))
+    assert evaluate(plain, env, episodes=1, first_seed=0)[0].steps == length_of(0)
 
 
 def test_workers_keep_the_statistics_that_they_started_with():

@@ -105,6 +105,30 @@ def test_an_environment_follows_statistics_that_are_loaded_later(batch, assign, 
         torch.testing.assert_close(found["next", "observation"].reshape(3, 4)[:, 2:], expected[:, 2:])
 
 
+def test_what_others_hold_of_statistics_stays_as_it_is():
+    def bounds(high):
+        return Normalizer({"action": torch.full((2,), -high)}, {"action": torch.full((2,), high)})
+
+    first, second, third = bounds(1.0), bounds(2.0), bounds(3.0)
+    transforms = normalizing_transforms(first)
+    env = TransformedEnv(CountingEnv(5), Compose(*transforms))
+    env.reset()
+    kept = first.state_dict()
+    for loaded in (second, third):
+        first.load_state_dict(loaded.state_dict(), assign=True)
+        env.reset()
+        torch.testing.assert_close(transforms[0].scale, loaded.scale("action"))
+    for normalizer, high in ((second, 2.0), (third, 3.0)):
+        assert (normalizer.scale("action") == bounds(high).scale("action")).all()
+    first.load_state_dict(kept)
+    assert (first.scale("action") == bounds(1.0).scale("action")).all()
+    # A collector pickles a policy without its numbers, and its environments keep theirs.
+    before = transforms[0].scale.clone()
+    first.to("meta")
+    env.reset()
+    assert torch.equal(transforms[0].scale, before)
+
+
 @pytest.mark.parametrize(
     ("spec", "kind"),
     [

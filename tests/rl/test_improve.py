@@ -5,6 +5,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
+import torch
 from torchrl.envs import SerialEnv
 
 from tests.envs.test_gymnasium import registered_dial
@@ -15,7 +16,9 @@ from tests.toy_env import mlp_actor
 from warmprior import GaussianPrior, PastPrior, RealTimeChunking, policy_transforms
 from warmprior.envs.description import environment_of, registered_description
 from warmprior.evaluation import evaluate, parallel_env
+from warmprior.io.workers import torch_threads
 from warmprior.rl import improve, improve_policy, improved_policy
+from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.saving import load_policy, save_policy
 from warmprior.saving.checkpoint import load_state
 
@@ -98,6 +101,23 @@ def test_a_policy_is_improved_compared_and_saved(tmp_path):
         and again.reach == result.reach > 0
         and (again.before, again.after) == (result.before, result.after)
     )
+
+
+def test_updates_have_the_threads_that_waiting_workers_would_take(tmp_path, monkeypatch):
+    threads, original = set(), PriorSpaceAgent.learn
+
+    def counting(agent, buffer):
+        threads.add(torch.get_num_threads())
+        return original(agent, buffer)
+
+    monkeypatch.setattr(PriorSpaceAgent, "learn", counting)
+    actor = make_actor()
+    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
+    with torch_threads(2):
+        config, options = make_config(environment_steps=60), {"make_env": make_env, "num_envs": 2}
+        options |= {"make_transforms": transforms, "description": None}
+        improve_policy(actor, tmp_path, config=config, episodes=2, **options)
+    assert threads == {2}
 
 
 @pytest.mark.parametrize("confirmed", [(1, 2), (2, 2), (2, 1)])

@@ -96,6 +96,8 @@ def test_networks_read_observations_in_doubles_and_need_one(make):
     box = {"delta": 0.5} if make is make_prior_space_actor else {}
     with raises(ValueError, "in_keys"):
         make(D_A, 40, P, in_keys=(), **box)
+    with raises(ValueError, "action_dim", "None"):
+        make(None, 40, P, **box)
     module = make(D_A, 4, P, 1, hidden_dim=8, num_layers=1, **box)
     chunks = {"anchor": torch.rand(5, P, D_A), "delta": torch.rand(5, P, D_A)}
     single = TensorDict({"observation": torch.rand(5, 1, 4), "prior": chunks}, [5])

@@ -152,12 +152,6 @@ class Demonstrations:
         found = tuple(shapes[key] for key in images)
         sides = {side for shape in found for side in shape}
         size = self.image_size or (IMAGE_SIZE if len(sides) > 1 else max(sides, default=0))
-        least, largest = IMAGE_SIZES
-        if images and not least <= size <= largest:
-            raise DatasetError(
-                f"{self}: {images[0]} has {size} pixels a side, and policies see {least} to {largest}: "
-                f"choose image_size, such as {IMAGE_SIZE}"
-            )
         return {
             "image_keys": tuple(images),
             "image_shapes": found,
@@ -259,6 +253,12 @@ class Demonstrations:
             OSError: if a download fails, or there is no space for images in the cache.
         """
         index = self.index(observations, images, poses=actions == "absolute")
+        least, largest = IMAGE_SIZES
+        if index.image_keys and not least <= index.image_size <= largest:
+            raise DatasetError(
+                f"{self}: {index.image_keys[0]} has {index.image_size} pixels a side, and policies see "
+                f"{least} to {largest}: choose image_size, such as {IMAGE_SIZE}"
+            )
         contents = partial(self.contents, index)
         digest = contents() if storage == "memmap" and index.image_keys else ""
         options: Any = {"actions": actions, "storage": storage}

@@ -59,7 +59,7 @@ def demonstrations_of(
     return _Steps(steps, name, style=style, normalised=normalised, **sized)
 
 
-_NO_OBSERVATIONS = ("frame", "next", "done", "terminated", "truncated")
+_NO_OBSERVATIONS = ("frame", "next", "done", "terminated", "truncated", "reward", "success", "is_init")
 """Entries of steps that are read nowhere, and that nobody expects a policy to see."""
 
 
@@ -93,7 +93,8 @@ class _Steps(Demonstrations):
         if steps[EPISODE].is_floating_point() or bool((steps[EPISODE] < 0).any()):
             raise ValueError(f"{EPISODE!r} of {name} must be whole numbers from 0 on, got {found}")
         self._values, self._vector = steps.select(*needed), vector
-        self._others = list(map(str, steps.exclude(*needed, *_NO_OBSERVATIONS).keys()))
+        others = map(str, steps.exclude(*needed, *_NO_OBSERVATIONS).keys())
+        self._others = [name for name in others if name not in self._images]
 
     @property
     @override

@@ -24,7 +24,6 @@ from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
-from warmprior.modules.normalize import Normalizer
 from warmprior.tasks.task import Task
 from warmprior.transforms.chunk import ChunkStep, Measures, check_measures, check_outside
 from warmprior.transforms.normalize import FollowsNormalizer
@@ -332,19 +331,19 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
 
 def _check_units(policy: TensorDictModuleBase, env: EnvBase, parts: list[Any]) -> None:
     """Raise ValueError if the transforms of an environment are seen to lack the policy's normaliser."""
-    # An agent acts through a policy's decoder, which keeps the normaliser that the policy had.
-    owners = (getattr(part, "normalizer", None) for part in policy.modules())
-    normalizer = next((own for own in owners if isinstance(own, Normalizer)), None)
+    normalizer = getattr(policy, "normalizer", None)
     batched = isinstance(base_of(env), SerialEnv | ParallelEnv)
     kinds: Any = FollowsNormalizer if batched else ActionScaling | ObservationNorm
     scalers = [part for part in parts if isinstance(part, kinds)]
-    if normalizer is None or (batched and not scalers):
-        return  # transforms inside workers cannot be inspected
+    if normalizer is None:
+        return
     for part in scalers:
         if isinstance(part, FollowsNormalizer):
             part.follow()  # as the next reset does
     scalings: dict[NestedKey, Any] = {(part.in_keys_inv or part.in_keys)[0]: part for part in scalers}
     for key in normalizer.keys:
+        if batched and key not in scalings:
+            continue  # it may be inside the workers, which cannot be seen
         for name in ("loc", "scale"):
             value = getattr(normalizer, name)(key)
             if key not in scalings or not torch.equal(getattr(scalings[key], name).to(value), value):

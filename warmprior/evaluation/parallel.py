@@ -16,6 +16,7 @@ from torchrl.envs.transforms import Compose
 
 from warmprior.checks import check_whole_numbers
 from warmprior.io.workers import WorkerError, dead_worker_error, end_with_parent, start_method
+from warmprior.transforms.normalize import FollowsNormalizer
 
 
 def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
@@ -28,12 +29,13 @@ class _StridedEnv(ParallelEnv):
 
     strided_seeds = True
     make_transforms: Callable[[], Compose]
-    started: Compose
-    """The transforms as the workers have them, which follow no policy of this process."""
+    started: list[FollowsNormalizer]
+    """The normalising transforms as the workers have them, which follow no policy of this process."""
 
     @override
     def _start_workers(self) -> None:
-        self.started = copy.deepcopy(self.make_transforms())
+        parts = self.make_transforms().modules()
+        self.started = [copy.deepcopy(part) for part in parts if isinstance(part, FollowsNormalizer)]
         try:
             super()._start_workers()
         except (ConnectionError, EOFError) as error:
@@ -88,7 +90,9 @@ def transforms_of(env: EnvBase) -> Iterator[nn.Module]:
         yield from transforms_of(env.base_env)
         yield from env.transform.modules()
     elif isinstance(env, _StridedEnv):
-        yield from (env.make_transforms() if env.is_closed else env.started).modules()
+        started = iter([] if env.is_closed else env.started)
+        for part in env.make_transforms().modules():
+            yield next(started, part) if isinstance(part, FollowsNormalizer) else part
 
 
 def base_of(env: EnvBase) -> EnvBase:

@@ -86,8 +86,8 @@ def improve_policy(
     evaluations is kept if it also solves more of other episodes, as the best of several is better by chance
     alone. The policies before and after then play a third set: that of ``python -m warmprior evaluate``.
 
-    The updates use as many threads as PyTorch does, while the workers wait. One seed repeats bit for bit with
-    the same number of threads.
+    The updates use as many threads as PyTorch had before, while the workers wait. One seed repeats bit for
+    bit with the same number of threads.
 
     Args:
         policy: the policy, such as one of :func:`~warmprior.saving.load_policy`. It must solve some

@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.checks import check_distinct, check_positive, check_whole_numbers, given
+from warmprior.checks import check_distinct, check_positive, check_whole_numbers
 from warmprior.rl.anchor import length_of_residuals
 
 
@@ -74,7 +74,8 @@ class _Sizes:
     residual_length: int | None
 
     def __post_init__(self) -> None:
-        check_whole_numbers(**given(**vars(self)))
+        lengths = {name: size for name, size in vars(self).items() if name != "residual_length"}
+        check_whole_numbers(**lengths)
         self.residual_length = length_of_residuals(self.residual_length, self.prediction_length)
 
     @property

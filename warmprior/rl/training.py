@@ -25,6 +25,7 @@ from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import transforms_of, watched
 from warmprior.io.files import check_writable, exclusive
 from warmprior.io.progress import progress_bar
+from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.options.agent import PriorSpaceConfig
 from warmprior.rl.agent import PriorSpaceAgent, WarmUpSwitch
@@ -206,6 +207,7 @@ class PriorSpaceTraining:
 
     def _run(self) -> None:
         config = self.config
+        threads = torch.get_num_threads()  # TorchRL takes those of workers off, which wait during updates
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
@@ -242,7 +244,8 @@ class PriorSpaceTraining:
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
-                    metrics = self.agent.learn(self.buffer)
+                    with torch_threads(threads):
+                        metrics = self.agent.learn(self.buffer)
                     last = {row["evaluation"]: row["success_rate"] for row in self.curve}
                     bar.set_postfix(metrics | last, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every

@@ -38,7 +38,7 @@ def check_real(key: NestedKey, action: TensorSpec, before: str) -> None:
         kind = f"{type(action).__name__} {list(action.shape)} of {action.dtype}"
         raise TypeError(
             f"the environment takes {kind} for {key}, and a policy writes real numbers: append a transform "
-            f"before {before} that rounds or encodes them"
+            f"before {before} that rounds or encodes them, and writes real numbers into the spec"
         )
 
 

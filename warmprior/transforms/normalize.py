@@ -36,9 +36,11 @@ class FollowsNormalizer(Transform):
     def follow(self) -> None:
         """Take the normaliser's statistics."""
         normalizer, key = self._source
-        for mine, theirs in ((self.loc, normalizer.loc(key)), (self.scale, normalizer.scale(key))):
-            if mine is not theirs:
-                mine.copy_(theirs)
+        for name, theirs in (("loc", normalizer.loc(key)), ("scale", normalizer.scale(key))):
+            mine = getattr(self, name)
+            # Not copied into mine, which others may hold. Collectors pickle policies without their numbers.
+            if mine is not theirs and not theirs.is_meta:
+                setattr(self, name, theirs.to(mine))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self.follow()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, override
@@ -25,6 +25,9 @@ EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "ac
 
 ENDINGS = (".hdf5", ".h5")
 """The usual endings of HDF5 files, in any case."""
+
+NAMED = 5
+"""The number of files and folders that are named where they are left out."""
 
 
 class RobomimicFolder(Demonstrations):
@@ -54,15 +57,16 @@ class RobomimicFolder(Demonstrations):
 
     @property
     def others(self) -> list[str]:
-        """HDF5 files that are not read: those with another ending, and the folders with further ones."""
+        """HDF5 files that are not read: those with another ending, and the folders that hold further ones."""
         is_hdf5, found = require("h5py", "sim").is_hdf5, []
         for path in sorted({*Path(self.place).iterdir()} - {*self.paths}):
-            below = sum(p.suffix.lower() in ENDINGS for p in path.rglob("*")) if path.is_dir() else 0
-            if below:
-                found.append(f"{path.name}/ with {below} file{'s' if below > 1 else ''}")
-            elif path.is_file() and is_hdf5(path):
-                found.append(path.name)
-        return found
+            with suppress(OSError):  # what may not be read is not needed either
+                if path.is_dir() and not path.is_symlink():
+                    below = sum(entry.suffix.lower() in ENDINGS for entry in path.iterdir())
+                    found += [f"{path.name}/ with {below} file{'s' if below > 1 else ''}"] if below else []
+                elif path.is_file() and is_hdf5(path):
+                    found.append(path.name)
+        return [*found[:NAMED], f"{len(found) - NAMED} more"] if len(found) > NAMED + 1 else found
 
     @override
     def check(self) -> None:

@@ -200,7 +200,7 @@ def _check_info(info: Any) -> str:
 def _check_columns(root: Path, metadata: Any, names: Sequence[str]) -> None:
     """Raise DatasetError unless ``meta/episodes`` has columns of whole numbers of at least 0."""
     for name in names:
-        values = metadata.episodes[name] if name in metadata.episodes.column_names else [None]
+        values = metadata.episodes[name][:] if name in metadata.episodes.column_names else [None]
         if not all(type(value) is int and value >= 0 for value in values):
             raise DatasetError(
                 f"{root}: meta/episodes has no whole numbers of at least 0 as {name}: download or convert it "
@@ -212,13 +212,16 @@ def _check_frames(root: Path, metadata: Any, video: str, chosen: Set[int]) -> No
     """Raise DatasetError if one of the chosen episodes has frames of a video that are another's as well."""
     names = [f"videos/{video}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
     with reading(f"{root}: {names[-1]} of meta/episodes", "Download or convert it again."):
-        columns = (metadata.episodes[name] for name in (*names, "length", "episode_index"))
-        places = sorted(zip(*columns, strict=True))
-        for (*file, start, length, number), (*following, begin, _, other) in pairwise(places):
+        columns = (metadata.episodes[name][:] for name in (*names, "length", "episode_index"))
+        last: tuple[list[Any], float, int] = [], 0.0, 0  # the file, and where which episode ends there
+        for *file, start, length, number in sorted(zip(*columns, strict=True)):
+            before, end, other = last
+            if file == before and start < end and not chosen.isdisjoint((number, other)):
+                raise ValueError(f"the frames of the episodes {other} and {number} overlap in {video}")
             # A video may lack its last frame.
-            same = file == following and begin < start + max(length - 1.5, 0.5) / metadata.fps
-            if same and not chosen.isdisjoint((number, other)):
-                raise ValueError(f"the frames of the episodes {number} and {other} overlap in {video}")
+            ends = start + max(length - 1.5, 0.5) / metadata.fps
+            if file != before or ends > end:
+                last = file, ends, number
 
 
 def _chosen(root: Path, what: str, numbers: Any, count: int) -> list[int]:
