@@ -162,6 +162,20 @@ def test_a_file_of_joints_has_no_names_of_poses(tmp_path):
     assert not equal(mine, RobomimicDemonstrations(path).steps(observations=seen))
 
 
+def test_images_of_a_size_that_no_policy_sees_are_copied_as_they_are(tmp_path):
+    path, shown = tmp_path / "lift.hdf5", np.random.default_rng(0).integers(0, 256, (3, 7, 7, 3), np.uint8)
+    write_robomimic_file(path, task="lift", lengths=(3,))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/obs/agentview_image"]
+        file["data/demo_0/obs/agentview_image"] = shown
+    convert_robomimic(path, tmp_path / "out", images="image")
+    place = LeRobotDemonstrations(tmp_path / "out")
+    index = place.index(images=["agentview_image"])
+    with place.reader(index) as reader:
+        (found,) = reader.images(index.demos[0], "agentview_image")
+    assert (found.permute(0, 2, 3, 1).numpy() == shown).all()
+
+
 def test_what_cannot_be_converted(tmp_path):
     path, folder = tmp_path / "lift.hdf5", tmp_path / "out"
     refuses(lambda: convert_robomimic(path, folder), FileNotFoundError, path)
