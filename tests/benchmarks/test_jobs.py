@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import re
 import signal
+import subprocess
 import sys
 import time
 from concurrent.futures import Future
@@ -152,6 +153,11 @@ def test_no_worker_outlives_the_driver(how, monkeypatch):
     while not any(map(is_a_worker_that_hears_no_ctrl_c, children := driver.children(recursive=True))):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    # What the tracker of killed workers finds gone is not said last.
+    (tracker,) = (child for child in children if "loky.backend.resource_tracker" in " ".join(child.cmdline()))
+    warned = "import warnings; warnings.warn('resource_tracker: /loky-1: FileNotFoundError(2)')"
+    quiet = subprocess.run([sys.executable, "-c", warned], env=tracker.environ(), capture_output=True)
+    assert not quiet.stderr
     workers = filter(is_a_worker_that_hears_no_ctrl_c, children)
     assert {worker.environ()["OMP_NUM_THREADS"] for worker in workers} == {"1"}
     # As Ctrl-C on a terminal does: all of them get it.

@@ -59,9 +59,12 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
         loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
 
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return require("loky", "sim").ProcessPoolExecutor(
-        max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
-    )
+    # Where processes are killed, loky's tracker of resources may find some gone, and would print so last.
+    quiet = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
+    with mock.patch.dict(os.environ, {"PYTHONWARNINGS": quiet}):
+        return require("loky", "sim").ProcessPoolExecutor(
+            max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
+        )
 
 
 @contextmanager
