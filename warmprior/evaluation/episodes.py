@@ -332,11 +332,11 @@ def _check_fit(policy: TensorDictModuleBase, env: EnvBase, success: NestedKey, m
 def _check_units(policy: TensorDictModuleBase, env: EnvBase, parts: list[Any]) -> None:
     """Raise ValueError if the transforms of an environment are seen to lack the policy's normaliser."""
     normalizer = getattr(policy, "normalizer", None)
+    if normalizer is None:
+        return
     batched = isinstance(base_of(env), SerialEnv | ParallelEnv)
     kinds: Any = FollowsNormalizer if batched else ActionScaling | ObservationNorm
     scalers = [part for part in parts if isinstance(part, kinds)]
-    if normalizer is None:
-        return
     for part in scalers:
         if isinstance(part, FollowsNormalizer):
             part.follow()  # as the next reset does
