@@ -119,7 +119,8 @@ def velocity_field(
     The observations, ``[B, To, *]`` or a tensordict, are encoded once. The network computes in its own dtype;
     the path is integrated, and its error measured, in that of the actions.
     """
-    dtype, encoding = precision_of(network), encoded(network, observation)
+    dtype = precision_of(network)
+    encoding = _encoded(network, observation, dtype)
     if dtype is None:
         return lambda t, a: network(t, a, encoding)
     return lambda t, a: network(t.to(dtype), a.to(dtype), encoding).to(a.dtype)
@@ -127,7 +128,13 @@ def velocity_field(
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
     """Return observations encoded by the network (:meth:`VelocityNetwork.encode`), in its own dtype."""
-    dtype, encodes = precision_of(network), getattr(network, "encodes", False)
+    return _encoded(network, observation, precision_of(network))
+
+
+def _encoded(
+    network: nn.Module, observation: Tensor | TensorDictBase, dtype: torch.dtype | None
+) -> Tensor | TensorDictBase:
+    encodes = getattr(network, "encodes", False)
 
     def cast(value: Tensor) -> Tensor:
         # Vectors [B, To, d] may be integers or flags; what is encoded, such as images, stays as it is.
