@@ -253,4 +253,4 @@ def _blanked[T: Tensor | TensorDictBase](value: T, unused: Tensor) -> T:
         return cast(T, value.apply(lambda entry: _blanked(entry, unused)))
     if not value.is_floating_point():
         return value
-    return cast(T, value.masked_fill(expand_as_right(unused, value) & ~value.isfinite(), 0.0))
+    return cast(T, torch.where(expand_as_right(unused, value), value.nan_to_num(0.0, 0.0, 0.0), value))
