@@ -77,7 +77,7 @@ class _Average(AveragedModel):
             cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
             torch._foreach_copy_(averages, weights)
-        for own, trained in owners:  # a forward pass may replace a buffer
-            for averaged, buffer in zip(own.buffers(False), trained.buffers(False), strict=True):
-                averaged.copy_(buffer)
+        if owners:  # a forward pass may replace a buffer, so they are collected anew
+            buffers = [[b for pair in owners for b in pair[i].buffers(False)] for i in (0, 1)]
+            torch._foreach_copy_(*buffers)
         self.n_averaged += 1
