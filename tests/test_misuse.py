@@ -8,6 +8,7 @@ from multiprocessing.popen_spawn_posix import _DupFd
 from multiprocessing.reduction import ForkingPickler
 from types import SimpleNamespace
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import GymEnv, RenameTransform, TransformedEnv
@@ -17,16 +18,23 @@ from tests.errors import raises, refuses
 from tests.processes import apart
 from tests.toy_env import demonstrations, mlp_actor
 from warmprior import (
+    CameraImages,
+    HistoryObservation,
+    Normalizer,
     PastPrior,
+    Prior,
     PriorDecoder,
     RealTimeChunking,
     ResidualSampler,
+    SourceMoments,
     VelocityMLP,
+    WarmPriorActor,
     policy_transforms,
     window_transforms,
 )
 from warmprior.envs import environment_of
 from warmprior.envs.description import registered_description
+from warmprior.history import cold_history
 from warmprior.keys import CHUNK
 from warmprior.training import BehaviourCloning, NetworkOptions, TrainingConfig, ema_of, train_policy
 
@@ -114,6 +122,62 @@ def test_what_train_policy_cannot_take():
         with raises(error, fact):
             train_policy(data, prior)
     refuses(lambda: train_policy(steps(), PRIOR, device="gpu"), ValueError, "gpu", "choose another")
+
+
+def velocity(entries):
+    return VelocityMLP(1, 3, 4, 1, hidden_dim=8)(torch.zeros(2), torch.zeros(2, 4, 1), entries)
+
+
+def moments(*values):
+    return SourceMoments(*(torch.full((4, 1), value) for value in values))
+
+
+def recorded(**entries):
+    return train_policy(steps().update(entries), PRIOR, **SHORT)
+
+
+def seeing(**entries):
+    """An environment's step for a network that sees the last actions."""
+    observation = TensorDict(entries, [2])
+    history = cold_history([2], 4, 4, 1)
+    return HistoryObservation()(TensorDict({"observation": observation, "history": history}, [2]))
+
+
+ONE = {"history": cold_history([1], 4, 4, 1), "observation": torch.zeros(1, 1, 3)}
+ONE |= {"vla_action": {"chunk": torch.zeros(1, 4, 1)}, "action_is_pad": torch.zeros(1, 4, dtype=torch.bool)}
+
+
+def stateful():
+    """An environment with a state, but no simulator that renders it."""
+    names = ["observation"], ["sim_state"]
+    return TransformedEnv(GymEnv("Pendulum-v1"), RenameTransform(*names, create_copy=True))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "facts"),
+    [
+        (lambda: WarmPriorActor(VelocityMLP(1, 3, 8, 1), PRIOR), ValueError, [8, 4, "prediction_length"]),
+        (lambda: actor(clip=(1.0, 1.0)), ValueError, ["clip", 2, 1]),
+        (lambda: velocity(TensorDict(arm=torch.zeros(2, 1, 3))), ValueError, ["'arm'", "(1, 3)"]),
+        (lambda: VelocityMLP(1, 3, 4, timestep_embedding_dim=5), ValueError, ["even", 5]),
+        (lambda: Prior(4).distribution(ONE["history"]), NotImplementedError, ["mean(history)"]),
+        (lambda: Normalizer(*2 * [{"action": torch.tensor([torch.nan])}]), ValueError, ["action", "NaN"]),
+        (lambda: moments(0.0, 0.0, 1.0, torch.inf, 0.0), ValueError, ["moments", "infinity"]),
+        (lambda: SourceMoments(*5 * [torch.zeros(4)]), ValueError, ["[P, d_a]", "(4,)"]),
+        (lambda: SourceMoments.fit(TensorDict(ONE, [1]), PRIOR), ValueError, [2, "windows", 1]),
+        (lambda: policy_transforms("past"), TypeError, ["WarmPriorActor", "Prior", "str"]),
+        (lambda: seeing(arm=torch.zeros(2, 1, 3)), ValueError, ["'arm'", "state"]),
+        (
+            lambda: TransformedEnv(stateful(), CameraImages(["front"], size=8)).reset(),
+            RuntimeError,
+            ["GymEnv"],
+        ),
+        (lambda: recorded(episode=torch.zeros(20)), ValueError, ["'episode'", "float32"]),
+        (lambda: recorded(episode=torch.full((20,), -1)), ValueError, ["'episode'", 0]),
+    ],
+)
+def test_what_does_not_fit_is_refused(call, error, facts):
+    refuses(call, error, *facts)
 
 
 def test_averages_can_be_pickled():

@@ -149,6 +149,11 @@ def test_observations_that_do_not_fit():
     upright = observation_of(3)
     upright[CAMERAS[0]] = upright[CAMERAS[0]].movedim(-3, -1)
     refuses(lambda: encoder(upright), ValueError, "[3, 2, 12, 12, 3]")
+    floats = observation_of(3)
+    floats[CAMERAS[0]] = floats[CAMERAS[0]].float()
+    refuses(lambda: encoder(floats), ValueError, "agentview_image", "float32", "uint8")
+    narrow = VelocityMLP(2, 5, 4, hidden_dim=16)
+    refuses(lambda: VisionNetwork(encoder, narrow), ValueError, 5, encoder.observation_dim)
 
 
 def policy_of(network):

@@ -152,6 +152,8 @@ def test_a_cast_trend_keeps_its_units(dtype):
 def test_source_and_target_have_one_length():
     with raises(ValueError, "target", "[3, 2]", "[4, 2]"):
         RestingTrend(RestingJoints([0, 1]), torch.zeros(2), torch.zeros(4, 2), torch.zeros(3, 2))
+    with raises(ValueError, "target", "NaN"):
+        RestingTrend(RestingJoints([0, 1]), torch.zeros(2), torch.zeros(4, 2), torch.full((4, 2), torch.nan))
 
 
 JOINTS = [1, 2, -1, 0, 3, 4, 5, 6, 7, -1]

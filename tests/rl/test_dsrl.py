@@ -154,6 +154,13 @@ def test_an_actor_of_torchrls_own_distribution_is_measured_in_units_of_the_box()
     torch.testing.assert_close(*results)
 
 
+def test_a_log_probability_per_action_is_refused():
+    loss = build()
+    loss.actor_network[-1].distribution_kwargs["event_dims"] = 1
+    with raises(ValueError, f"({N}, {H})", f"({N},)", "event_dims=2"):
+        loss(batch())
+
+
 @pytest.mark.parametrize("discount", ["step", "decision"])
 def test_decisions_that_multistep_joins_are_refused(discount):
     """TorchRL's transform keeps the first decision's end and executed steps."""

@@ -98,6 +98,12 @@ def test_networks_read_observations_in_doubles_and_need_one(make):
         make(D_A, 40, P, in_keys=(), **box)
     with raises(ValueError, "action_dim", "None"):
         make(None, 40, P, **box)
+    wide = {
+        "observation": torch.zeros(2, 2, 41),
+        "prior": dict.fromkeys(("anchor", "delta"), torch.zeros(2, P, D_A)),
+    }
+    with raises(ValueError, "(2, 2, 41)"):
+        make(D_A, 40, P, **box)(TensorDict(wide, [2]))
     module = make(D_A, 4, P, 1, hidden_dim=8, num_layers=1, **box)
     chunks = {"anchor": torch.rand(5, P, D_A), "delta": torch.rand(5, P, D_A)}
     single = TensorDict({"observation": torch.rand(5, 1, 4), "prior": chunks}, [5])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.data import Bounded, Categorical
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -131,6 +131,10 @@ def test_what_no_chunk_can_be():
         TransformedEnv(SerialEnv(2, lambda: number), ChunkStep(3)).rollout(1)
     env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
     refuses(lambda: env.step(ones(2)(env.reset())), ValueError, "'reward'")
+    number = CountingEnv(4)
+    number.reward_spec = Composite(one=Unbounded((1,)), two=Unbounded((1,)))
+    with raises(RuntimeError, "one", "two", "'done'"):
+        TransformedEnv(number, ChunkStep(2)).rollout(1, ones(2))
 
 
 @pytest.mark.parametrize("place", ["single", "outside"])

@@ -190,3 +190,6 @@ def test_numbers_that_do_not_go_together():
     whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
     assert whole.rollout(2, lagging(6))["next", "executed_steps"].flatten().tolist() == [4, 4]
     refuses(lambda: whole.step(lagging(6)(whole.reset()).exclude("rtc")), KeyError, "delay")
+    more = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
+    next(part for part in more.transform if isinstance(part, InferenceDelay)).execute = 3
+    refuses(lambda: more.rollout(1, lagging(6)), RuntimeError, "ChunkStep", 4, 3)
