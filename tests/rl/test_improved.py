@@ -1,6 +1,5 @@
 """A policy improved by an agent decodes what the agent's environment decodes, and is a policy like others."""
 
-import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -12,6 +11,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.errors import raises
+from tests.processes import apart
 from tests.rl.training_parts import H, SolvableEnv, make_actor
 from tests.states import same
 from tests.toy_env import ACTION_DIM, Halfway, Learned, random_history, stirred
@@ -144,11 +144,18 @@ def test_it_is_saved_and_plays_like_any_policy(case, tmp_path):
 def test_a_process_that_knows_no_agents_loads_it(tmp_path):
     actor = make_actor().replace(network=VelocityMLP(ACTION_DIM, WIDTH, H, observation_steps=1))
     save_policy(improved_policy(actor, make_agent(actor), nfe=2), tmp_path)
-    program = (
-        "import sys; from warmprior.saving import load_policy; print(load_policy(sys.argv[1]).start.name)"
-    )
-    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True)
-    assert done.stdout == "agent\n", done.stderr
+
+    @apart
+    def loaded():
+        """As a new process, which would import PyTorch for seconds, but no part of this library."""
+        for name in [name for name in sys.modules if name.split(".")[0] == "warmprior"]:
+            del sys.modules[name]
+        from warmprior.saving import load_policy
+
+        agents = "warmprior.rl" in sys.modules
+        return agents, load_policy(tmp_path).start.name
+
+    assert loaded() == (False, "agent")
 
 
 def test_the_policy_before_stays_as_it_is():
@@ -164,11 +171,16 @@ def test_the_policy_before_stays_as_it_is():
     assert policy.network is actor.network
 
 
+class Seeing(VelocityMLP):
+    encodes = True
+
+
 @pytest.mark.parametrize(
     ("change", "agent", "words"),
     [
         ({"guidance": RealTimeChunking(horizon=2)}, {}, ["guidance=None"]),
         ({}, {"in_keys": [keys.OBSERVATION, "goal"]}, ["goal", "anchor"]),
+        ({"network": Seeing(ACTION_DIM, WIDTH, H, observation_steps=1)}, {}, ["images"]),
     ],
 )
 def test_what_no_policy_can_do_is_refused(change, agent, words):
