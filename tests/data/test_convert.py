@@ -183,6 +183,7 @@ def test_what_cannot_be_converted(tmp_path):
     with raises(ValueError, "images", "image, video", "'gif'"):
         convert_robomimic(path, folder, images="gif")
     refuses(lambda: convert_robomimic(path, folder, images="video"), ValueError, 32, 8)
+    refuses(lambda: convert_robomimic(path, tmp_path), FileExistsError, tmp_path)
     with h5py.File(path, "a") as file:
         del file["data/demo_0/obs/agentview_image"]
         file["data/demo_0/obs/robot0_eef_pos"][1] = np.nan

@@ -28,6 +28,7 @@ def _no_demos(file, folder):
 ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
+    "dataset for observations": (replaced("obs", np.zeros(3)), ["data/demo_1/obs", "dataset", "group"]),
     "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
     "type": (
         env_args(json.dumps({"env_name": "Lift", "type": {}, "env_kwargs": {}})),

@@ -121,6 +121,9 @@ META = {
     ),
     "data of a camera": (info_of("data_path", "{video_key}/{chunk_index}"), ["data_path="]),
     "a number of a camera": (info_of("video_path", "{video_key:03d}"), ["video_path="]),
+    "other counts": (info_of("total_frames", 99), ["meta/info.json", 99, "meta/episodes"]),
+    "another version": (described(format=2), ["warmprior.json", "version"]),
+    "narrow actions": (feature("action", shape=[6], names=None), ["'action'", 6, "Lift", 7]),
     "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),
     "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
     "no length": (table(EPISODES, length=entry(0, None, None)), ["length"]),
@@ -172,6 +175,10 @@ IMAGES = {
         "agentview_image",
     ),
     "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
+    "outside": (
+        info_of("data_path", "../{chunk_index}/{file_index}.parquet"),
+        ["'../0/0.parquet'", "folder"],
+    ),
 }
 
 
