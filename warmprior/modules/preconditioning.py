@@ -295,43 +295,26 @@ class PreconditionedNetwork(VelocityNetwork):
     def remainder(self, t: Tensor) -> Tensor:
         """Return the unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
         coefficients = self.interpolant.coefficients(t[:, None, None])
-        # Every training step asks for it: the slope takes as long, and only a chosen one adds to the unit.
-        line = self._linear if self.moments.conditional else self._deviations
-        return line(*coefficients)[-1]
+        if self.moments.conditional:
+            return self._linear(*coefficients)[2]
+        # Every training step asks for it, and the slope would take as long again.
+        return _deviations(self._moments(), *coefficients)[1]
 
-    def _moments(self, prefix: str) -> tuple[Tensor, ...]:
-        return tuple(getattr(self.moments, prefix + name) for name in (*_SECOND, "conditional_deviation"))
-
-    def _deviations(
-        self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor, prefix: str = ""
-    ) -> tuple[Tensor, Tensor]:
-        """Return one over the point's deviation, and the deviation that the best slope leaves."""
-        v0, _, c, q = self._moments(prefix)
-        s0 = v0.sqrt()
-        # a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
-        along, across = _combination(s0, alpha, c / s0, beta), beta * q
-        scale = torch.addcmul(along * along, across, across).rsqrt()
-        return scale, (alpha * d_beta - d_alpha * beta).abs() * (s0 * q) * scale
-
-    def _slope(
-        self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor, scale: Tensor, prefix: str = ""
-    ) -> Tensor:
-        """Return the best slope of the velocity, from one over the point's deviation."""
-        v0, v1, c, _ = self._moments(prefix)
-        covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
-        covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
-        return covariance * scale * scale
+    def _moments(self, prefix: str = "") -> list[Tensor]:
+        return [getattr(self.moments, prefix + name) for name in (*_SECOND, "conditional_deviation")]
 
     def _linear(self, *coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the slope of the velocity, one over the point's deviation, and the unit of ``F``.
 
         The unit has two parts: what the best slope over all data leaves, and what the chosen one adds.
         """
-        scale, unit = self._deviations(*coefficients)
-        best = self._slope(*coefficients, scale)
+        moments = self._moments()
+        scale, unit = _deviations(moments, *coefficients)
+        best = _slope(moments, scale, *coefficients)
         if not self.moments.conditional:
             return best, scale, unit
-        slope = self._slope(*coefficients, self._deviations(*coefficients, "given_")[0], "given_")
+        given = self._moments("given_")
+        slope = _slope(given, _deviations(given, *coefficients)[0], *coefficients)
         return slope, scale, torch.hypot(unit, (best - slope) / scale)
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
@@ -347,6 +330,28 @@ class PreconditionedNetwork(VelocityNetwork):
         learnt = self.network(t, centred * scale, observation)
         velocity = torch.addcmul(slope * centred, unit, learnt)
         return velocity + _combination(m0, d_alpha, m1, d_beta)
+
+
+def _deviations(
+    moments: Sequence[Tensor], alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return one over the point's deviation, and the deviation that the best slope leaves."""
+    v0, _, c, q = moments
+    s0 = v0.sqrt()
+    # a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
+    along, across = _combination(s0, alpha, c / s0, beta), beta * q
+    scale = torch.addcmul(along * along, across, across).rsqrt()
+    return scale, (alpha * d_beta - d_alpha * beta).abs() * (s0 * q) * scale
+
+
+def _slope(
+    moments: Sequence[Tensor], scale: Tensor, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
+) -> Tensor:
+    """Return the best slope of the velocity, from one over the point's deviation."""
+    v0, v1, c, _ = moments
+    covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
+    covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
+    return covariance * scale * scale
 
 
 def _combination(x: Tensor, x_weight: Tensor, y: Tensor, y_weight: Tensor) -> Tensor:
