@@ -78,6 +78,6 @@ class _Average(AveragedModel):
         else:
             torch._foreach_copy_(averages, weights)
         if owners:  # a forward pass may replace a buffer, so they are collected anew
-            buffers = [[b for pair in owners for b in pair[i].buffers(False)] for i in (0, 1)]
-            torch._foreach_copy_(*buffers)
+            averaged, current = ([b for pair in owners for b in pair[i].buffers(False)] for i in (0, 1))
+            torch._foreach_copy_(averaged, current)
         self.n_averaged += 1
