@@ -148,6 +148,7 @@ def learn(
         evaluation_seed=options.evaluation.starts(seed).start,
         description=name,
         collect=rounds,
+        compile=options.run.compile,
     )
     with torch_threads(None):  # TorchRL resets the number of threads when workers end
         training.run()

@@ -116,18 +116,19 @@ def test_around_zero_the_source_is_what_the_agent_says(prior, length):
     assert anchors[0].any() and not anchors[1].any()
 
 
-def test_the_time_limit_is_that_of_the_policys_environment_unless_one_is_given(tmp_path, monkeypatch):
+def test_time_limit_and_compilation_reach_the_training(tmp_path, monkeypatch):
+    """The time limit is that of the policy's environment unless one is given."""
     given = []
 
     class Recorded:
         def __init__(self, actor, make_env, *args, **options):
-            given.append(make_env.args[-1])
+            given.append((make_env.args[-1], options["compile"]))
 
         def run(self):
             pass
 
     monkeypatch.setattr("warmprior.rl.PriorSpaceTraining", Recorded)
-    for words, found in (("", {}), ("--horizon 20", {"horizon": 20})):
+    for words, found in (("", ({}, False)), ("--horizon 20 --compile", ({"horizon": 20}, True))):
         recipe = read(f"--task can --prior past {words}")
         (method,) = recipe.sources.methods()
         actor = WarmPriorActor(VelocityMLP(7, 23, 8, hidden_dim=8), method.prior(), nfe=1)
