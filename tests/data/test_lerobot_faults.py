@@ -172,6 +172,11 @@ IMAGES = {
         "agentview_image",
     ),
     "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
+    "no last frame": (  # of the last episode, which begins at 0.35 s
+        table(EPISODES, videosSLASHobservation__images__sideSLASHfrom_timestamp=entry(2, 0.4, None)),
+        [MOVIE, "episode 2", "lerobot-edit-dataset"],
+        "side_image",
+    ),
 }
 
 
