@@ -100,7 +100,7 @@ def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
 
 def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
     pytest.importorskip("lerobot.datasets")
-    from tests.data.lerobot_parts import numbers, write_lerobot
+    from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
 
     features = {"observation.state": numbers(6), "observation.effort": numbers(6), "action": numbers(6)}
     write_lerobot(tmp_path / "arm", (8, 8), features, images=[("front", "image")], fps=30)
@@ -110,6 +110,12 @@ def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
     seeing = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}"), images=["observation.images.front"])
     assert seeing.recording.names == {"front_image": "observation.images.front"}
     assert "images" not in seeing.recording.left_out
+    # Without language a policy cannot know which of several tasks it is asked for.
+    episodes = tmp_path / "arm" / "meta/episodes/chunk-000/file-000.parquet"
+    edit_table(episodes, tasks=lambda tasks: [["lift"], ["push"]])
+    for demos, unseen in ((2, ["task, one of 2"]), (1, [])):
+        dataset = open_demonstrations(f"lerobot:{tmp_path / 'arm'}", demos=demos)
+        assert Task(dataset).recording.left_out.get("", []) == unseen
 
 
 def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):
