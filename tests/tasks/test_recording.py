@@ -11,6 +11,7 @@ from warmprior import GaussianPrior, PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
 from warmprior.deploy import AsyncExecutor
+from warmprior.modules.recording import Recording
 from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -81,6 +82,12 @@ def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     assert recording.left_out["observations"] == ["robot0_eef_pos", "robot0_gripper_qpos"]
     assert "images" not in recording.left_out and not missing(recording.images["wrist"], "6 x 8", "8 x 8")
     assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
+
+
+def test_each_of_several_images_stands_apart():
+    sizes = {"front": "480 x 640, seen at 84 x 84 (pad)", "wrist": "84 x 84"}
+    said = Recording("arm", 1, 9, "[2]", {"joints": 2}, sizes).lines()["images"]
+    assert said.split("; ") == [f"{name}, {size}" for name, size in sizes.items()]
 
 
 @pytest.mark.parametrize("options", [{"image_size": 8}, {"resize": "pad"}])
