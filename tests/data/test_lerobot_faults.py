@@ -179,6 +179,11 @@ IMAGES = {
         info_of("data_path", "../{chunk_index}/{file_index}.parquet"),
         ["'../0/0.parquet'", "folder"],
     ),
+    "no last frame": (  # of the last episode, which begins at 0.35 s
+        table(EPISODES, videosSLASHobservation__images__sideSLASHfrom_timestamp=entry(2, 0.4, None)),
+        [MOVIE, "episode 2", "lerobot-edit-dataset"],
+        "side_image",
+    ),
 }
 
 

@@ -464,6 +464,13 @@ def test_what_repeats_or_skips_chunks_from_outside_is_refused(batch, outside):
         evaluate(mlp_actor(PRIOR, nfe=1), env, episodes=2, first_seed=0)
 
 
+def test_a_frame_skip_of_one_repeats_nothing_and_is_played():
+    actor = mlp_actor(PRIOR, nfe=1)
+    inside = SerialEnv(1, lambda: TransformedEnv(SeededEnv(), policy_transforms(PRIOR)))
+    skipped = evaluate(actor, TransformedEnv(inside, FrameSkipTransform(1)), episodes=2, first_seed=0)
+    assert skipped == evaluate(actor, inside, episodes=2, first_seed=0)
+
+
 @pytest.mark.parametrize("given", [{"success": "solved"}, {"measures": {"reward": "sum"}}])
 def test_a_task_has_its_own_success_and_measures(given):
     rows = TensorDict({"observation": torch.rand(9, 1), "action": torch.rand(9, ACTION_DIM)}, [9])

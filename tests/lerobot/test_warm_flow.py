@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import WIDTHS, numbers, write_lerobot
+from tests.data.lerobot_parts import WIDTHS, edit_table, numbers, write_lerobot
 from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import (
     NEEDS_PLUGIN,
@@ -135,6 +135,11 @@ def test_a_training_says_what_it_uses_of_the_dataset(found, tmp_path, caplog):
     dataset_policy(found, tmp_path / "data", input_features=seen, **sizes)
     assert "left out      observation.images.side (--policy.input_features)" in caplog.messages[-1]
     assert "(squeeze)" in caplog.messages[-1] and "3 demonstrations, 18 steps" in caplog.messages[-1]
+    episodes = tmp_path / "data" / "meta/episodes/chunk-000/file-000.parquet"
+    edit_table(episodes, tasks=lambda tasks: [["lift"], ["push"], ["lift"]])
+    for chosen, unseen in ((None, "task, one of 2 (no option takes it)"), ([0, 2], "nothing")):
+        dataset_policy(found, tmp_path / "data", chosen, **sizes)
+        assert f"left out      {unseen}" in caplog.messages[-1]
     blind = {name: entry for name, entry in seen.items() if "images" not in name}
     dataset_policy(found, tmp_path / "data", input_features=blind)
     for options in ({"image_size": 24}, {"resize": "pad"}, {"crop_size": 8}, {"encoder": "small"}):

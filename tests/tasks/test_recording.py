@@ -11,6 +11,7 @@ from warmprior import GaussianPrior, PastPrior
 from warmprior.__main__ import main
 from warmprior.data import DatasetError, open_demonstrations
 from warmprior.deploy import AsyncExecutor
+from warmprior.modules.recording import Recording
 from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
@@ -83,6 +84,12 @@ def test_what_is_named_is_used_and_no_longer_left_out(tmp_path):
     assert (recording.demonstrations, recording.steps) == (3, sum(LENGTHS))
 
 
+def test_each_of_several_images_stands_apart():
+    sizes = {"front": "480 x 640, seen at 84 x 84 (pad)", "wrist": "84 x 84"}
+    said = Recording("arm", 1, 9, "[2]", {"joints": 2}, sizes).lines()["images"]
+    assert said.split("; ") == [f"{name}, {size}" for name, size in sizes.items()]
+
+
 @pytest.mark.parametrize("options", [{"image_size": 8}, {"resize": "pad"}])
 def test_a_size_of_images_without_images_is_refused(tmp_path, options):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"), **options)
@@ -100,7 +107,7 @@ def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
 
 def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
     pytest.importorskip("lerobot.datasets")
-    from tests.data.lerobot_parts import numbers, write_lerobot
+    from tests.data.lerobot_parts import edit_table, numbers, write_lerobot
 
     features = {"observation.state": numbers(6), "observation.effort": numbers(6), "action": numbers(6)}
     write_lerobot(tmp_path / "arm", (8, 8), features, images=[("front", "image")], fps=30)
@@ -110,6 +117,12 @@ def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
     seeing = Task(open_demonstrations(f"lerobot:{tmp_path / 'arm'}"), images=["observation.images.front"])
     assert seeing.recording.names == {"front_image": "observation.images.front"}
     assert "images" not in seeing.recording.left_out
+    # Without language a policy cannot know which of several tasks it is asked for.
+    episodes = tmp_path / "arm" / "meta/episodes/chunk-000/file-000.parquet"
+    edit_table(episodes, tasks=lambda tasks: [["lift"], ["push"]])
+    for demos, unseen in ((2, ["task, one of 2"]), (1, [])):
+        dataset = open_demonstrations(f"lerobot:{tmp_path / 'arm'}", demos=demos)
+        assert Task(dataset).recording.left_out.get("", []) == unseen
 
 
 def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):

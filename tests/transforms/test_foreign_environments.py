@@ -159,8 +159,9 @@ def every_second(tensordict):
 def test_a_chunk_is_not_repeated():
     env = TransformedEnv(CountingEnv(30), Compose(*policy_transforms(PRIOR), FrameSkipTransform(2)))
     refuses(lambda: env.reset(), RuntimeError, "FrameSkipTransform", "before")
-    env = TransformedEnv(CountingEnv(30), Compose(FrameSkipTransform(2), *policy_transforms(PRIOR)))
-    assert env.step(POLICY(env.reset()))["next", keys.EXECUTED] == H
+    for before, after in ([FrameSkipTransform(2)], []), ([], [FrameSkipTransform(1)]):
+        env = TransformedEnv(CountingEnv(30), Compose(*before, *policy_transforms(PRIOR), *after))
+        assert env.step(POLICY(env.reset()))["next", keys.EXECUTED] == H
 
 
 @pytest.mark.parametrize("rows", [(), (9, 30)])

@@ -62,6 +62,18 @@ def number_names(feature: Mapping[str, Any]) -> list[str]:
     return [*names] if all(isinstance(name, str) for name in names) else []
 
 
+def unseen_tasks(episodes: Iterable[Any]) -> list[str]:
+    """Return what a policy without language does not see, given the task texts of each episode.
+
+    Examples:
+        >>> from warmprior.lerobot.names import unseen_tasks
+        >>> unseen_tasks([["pick"], ["place"], ["pick"]]), unseen_tasks([["pick"], ["pick"]])
+        (['task, one of 2'], [])
+    """
+    texts = {str(text) for tasks in episodes for text in (tasks if isinstance(tasks, list) else [tasks])}
+    return [f"task, one of {len(texts)}"] if len(texts) > 1 else []
+
+
 def named_joints(features: Mapping[str, Any], observed: Container[str]) -> str:
     """Return the observation with the same names as the actions, which may be its absolute targets.
 

@@ -91,7 +91,7 @@ class Recording:
         return {
             "data": f"{self.name}: {demonstrations}, {self.steps:,} steps",
             "observations": ", ".join(f"{name} [{width}]" for name, width in self.observations.items()),
-            "images": ", ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
+            "images": "; ".join(f"{name}, {size}" for name, size in self.images.items()) or "none",
             "left out": "; ".join(left_out) or "nothing",
             "actions": self.actions + (hint if self.actions.endswith(AS_RECORDED) else ""),
             "rate": "unknown" if self.rate is None else f"{self.rate:g} control steps per second",

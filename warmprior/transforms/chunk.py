@@ -72,6 +72,11 @@ def _descriptions(env: EnvBase) -> list[str]:
     return [worker.env_str for worker in workers]
 
 
+def _acts_as(part: Transform, kind: type[Transform]) -> bool:
+    """Whether a transform is of a kind and does anything: a ``FrameSkipTransform(1)`` does not."""
+    return isinstance(part, kind) and getattr(part, "frame_skip", None) != 1
+
+
 def check_outside(env: EnvBase) -> None:
     """Raise RuntimeError if a transform outside of environments with :class:`ChunkStep` belongs inside.
 
@@ -81,7 +86,7 @@ def check_outside(env: EnvBase) -> None:
         parts, env = list(flat(env.transform)), env.base_env
         inside = any("ChunkStep(" in text for text in _descriptions(env))
         for kind, why in _INSIDE.items() if inside else ():
-            if any(isinstance(part, kind) for part in parts):
+            if any(_acts_as(part, kind) for part in parts):
                 raise RuntimeError(f"{kind.__name__} outside of the environment with ChunkStep {why}")
 
 
@@ -330,7 +335,7 @@ class ChunkStep(EnvTransform):
         container = self.container
         transforms = list(flat(container.transform)) if isinstance(container, TransformedEnv) else [self]
         place = next(i for i, transform in enumerate(transforms) if transform is self)
-        if any(isinstance(transform, FrameSkipTransform) for transform in transforms[place:]):
+        if any(_acts_as(transform, FrameSkipTransform) for transform in transforms[place:]):
             raise RuntimeError(
                 "FrameSkipTransform after ChunkStep would repeat chunks, of which the history sees one: "
                 "append it before, where it repeats single actions"

@@ -87,8 +87,9 @@ def normalizing_transforms(normalizer: Normalizer, action_key: NestedKey = keys.
     """Return TorchRL transforms that (de)normalise directly after the base environment.
 
     Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step. They share the
-    normaliser's statistics, and follow it where others are loaded into it, from the next reset on. Workers in
-    other processes keep those of their start.
+    normaliser's statistics, and follow it where others are loaded into it, from the next reset on: of
+    simulators that restart rows themselves (``native_autoreset``), from the next call of ``reset``. Workers
+    in other processes keep those of their start.
 
     Raises:
         TypeError: at the environment, if its actions are integers.

@@ -8,7 +8,7 @@ from typing import Any
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from warmprior.keys import ACTION
-from warmprior.lerobot.names import number_names
+from warmprior.lerobot.names import number_names, unseen_tasks
 from warmprior.modules.recording import AS_RECORDED, Recording, image_words
 
 OF_IMAGES = ("encoder", "image_size", "resize", "crop_size")
@@ -32,6 +32,8 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
     chosen = range(len(lengths)) if episodes is None else episodes
     seen = {*config.observed, *config.image_features}
     others = [name for name in described if name.startswith("observation") and name not in seen]
+    tasks = dataset_meta.episodes["tasks"]
+    left_out = {"input_features": others, "": unseen_tasks(tasks[number] for number in chosen)}
     numbers = {name: number_names(described[name]) for name in (*config.observed, ACTION)}
     meaning = f", absolute targets of {config.joints}" if config.joints not in ("", "auto") else AS_RECORDED
     sized = config.image_size, config.resize
@@ -42,7 +44,7 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
         f"[{config.action_feature.shape[0]}]{meaning}",
         {name: config.input_features[name].shape[0] for name in config.observed},
         {name: image_words(entry.shape[1:], *sized) for name, entry in config.image_features.items()},
-        left_out={"input_features": others} if others else {},
+        left_out={taken_by: names for taken_by, names in left_out.items() if names},
         rate=dataset_meta.fps,
         numbers={name: names for name, names in numbers.items() if names},
     )

@@ -25,7 +25,7 @@ from warmprior.data.formats.lerobot_index import (
     is_remote,
     read_lerobot_index,
 )
-from warmprior.data.index import DatasetIndex, DemonstrationReader, reading, store_finite
+from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader, reading, store_finite
 from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import task_env_args
 from warmprior.io.extras import require
@@ -132,10 +132,22 @@ class LeRobotReader(DemonstrationReader):
         return "lerobot", {"pyav": "av"}.get(backend, backend)
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
-        decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
+        video = require("lerobot.datasets.video_utils", "lerobot")
         times = self._rows(episode, "timestamp")[:, 0].astype(np.float64)
         times += episode[f"videos/{feature}/from_timestamp"]
-        return lambda first, stop: decode(path, times[first:stop].tolist(), TOLERANCE, return_uint8=True)
+
+        def frames(first: int, stop: int) -> Tensor:
+            wanted = times[first:stop].tolist()
+            try:
+                return video.decode_video_frames(path, wanted, TOLERANCE, return_uint8=True)
+            # No frame is near a time; torchcodec's error where the video ends before.
+            except (video.FrameTimestampError, IndexError) as error:
+                raise DatasetError(
+                    f"{path} lacks frames of episode {episode['episode_index']}, from {wanted[0]:.2f} to "
+                    f"{wanted[-1]:.2f} s. {_REBUILD}"
+                ) from error
+
+        return frames
 
 
 def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:

@@ -23,7 +23,7 @@ from warmprior.data.index import (
 from warmprior.envs.robosuite_tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import check_regular, digest_of, file_digest, is_repository, read_json
-from warmprior.lerobot.names import ROBOT_STATE, named_joints, number_names, short_names
+from warmprior.lerobot.names import ROBOT_STATE, named_joints, number_names, short_names, unseen_tasks
 
 if TYPE_CHECKING:
     from warmprior.data.formats.lerobot import LeRobotDemonstrations
@@ -91,6 +91,13 @@ class LeRobotIndex(DatasetIndex):
         parts = {key: self.columns[key] for key in self.observation_keys} | {"action": ("action", whole)}
         named = {key: number_names(features[name])[columns] for key, (name, columns) in parts.items()}
         return {key: names for key, names in named.items() if names}
+
+    @property
+    @override
+    def left_out(self) -> dict[str, list[str]]:
+        others = super().left_out
+        tasks = unseen_tasks(row.get("tasks") for row in self.episodes)
+        return others | {"": [*others.get("", []), *tasks]} if tasks else others
 
     @property
     def videos(self) -> list[str]:
