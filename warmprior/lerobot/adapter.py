@@ -195,15 +195,15 @@ class WarmPriorAdapter:
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
         # Raw states at the last decision, and at the current one.
-        self._state: Tensor | None = None
-        self._now: Tensor | None = None
-        self._sampling = False
-        # Control steps until the new chunk takes effect; and the last chunk's rest, number of actions left,
-        # delay and source width, all over the whole chunk.
+        self._state_before: Tensor | None = None
+        self._state_now: Tensor | None = None
+        self._bypassed = False
+        # Control steps until the new chunk takes effect.
         self._delay = 0
         # The number of actions that predict_action_chunk returned last.
-        self._given = 0
-        self._guiding: tuple[Tensor, Tensor, Tensor, Tensor]
+        self._returned = 0
+        # The last chunk's rest, number of actions left, delay and source width, all over the whole chunk.
+        self._guidance_inputs: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def action_indices(self) -> list[int]:
@@ -288,13 +288,13 @@ class WarmPriorAdapter:
                 than the delay.
         """
         call = self.policy.predict_action_chunk if predict is None else predict
-        if self._sampling:  # on the way from select_action
+        if self._bypassed:  # on the way from select_action
             return call(batch, **kwargs)
         self._expect(batch)
         if executed_steps is not None:
             self._memory.executed(executed_steps)
         elif LEFT_OVER in kwargs:
-            forecast_steps = self._memory.infer_executed(kwargs[LEFT_OVER], self._given)
+            forecast_steps = self._memory.infer_executed(kwargs[LEFT_OVER], self._returned)
             delay = min(kwargs.get("inference_delay") or 0, forecast_steps)
         check_whole_numbers(0, delay=delay)
         self._delay = delay
@@ -304,7 +304,7 @@ class WarmPriorAdapter:
         finally:
             self._delay = 0
         chunk = self._spliced(chunk)[:, : self.prior.prediction_length]
-        self._given = chunk.shape[1]
+        self._returned = chunk.shape[1]
         return chunk
 
     def record_executed(self, action: Tensor) -> None:
@@ -337,11 +337,11 @@ class WarmPriorAdapter:
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Let a policy of the plugin sample as its base class does, without its adapter."""
-        before, self._sampling = self._sampling, True
+        before, self._bypassed = self._bypassed, True
         try:
             yield
         finally:
-            self._sampling = before
+            self._bypassed = before
 
     @contextmanager
     def _from_source(self) -> Iterator[None]:
@@ -353,11 +353,11 @@ class WarmPriorAdapter:
     def _guided(self, velocity: Velocity) -> Velocity:
         """Return a velocity of the whole chunk, guided towards the forecast of the last one."""
         assert self.guidance is not None
-        return self.guidance.guided(velocity, *self._guiding)
+        return self.guidance.guided(velocity, *self._guidance_inputs)
 
     def _spliced(self, chunk: Tensor) -> Tensor:
         """Return a chunk whose first actions, until it takes effect, are those of the last chunk."""
-        forecast, _, delay, _ = self._guiding
+        forecast, _, delay, _ = self._guidance_inputs
         return spliced(chunk, forecast[:, : chunk.shape[1], : chunk.shape[2]], delay)
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -385,8 +385,8 @@ class WarmPriorAdapter:
         """Draw the source of every environment."""
         move = None
         if self._relative is not None:
-            relative, before, now = self._relative, self._state, self._relative.state()
-            self._now = now
+            relative, before, now = self._relative, self._state_before, self._relative.state()
+            self._state_now = now
 
             def move(actions: Tensor) -> Tensor:
                 assert before is not None, "there was a decision, and it had a state"
@@ -405,9 +405,9 @@ class WarmPriorAdapter:
         forecast, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
         predicted = (..., self.source.positions, slice(self.source.action_dim))
         forecast[predicted], width[predicted] = history["forecast"].to(dtype), scale
-        self._guiding = forecast, forecast_steps, delay, width
+        self._guidance_inputs = forecast, forecast_steps, delay, width
         return self.source.place(a0, self.generator).to(dtype)
 
     def _record(self, actions: Tensor) -> None:
-        self._state = self._now
+        self._state_before = self._state_now
         self._memory.record(self._spliced(actions)[:, self.source.positions, : self.source.action_dim])

@@ -1,4 +1,4 @@
-"""Integration of a velocity network from the source to the action chunk."""
+"""Integration from the source to the action chunk, and its options: NFE, solver, grid, clip, temperature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distributions of the times of a flow-matching loss."""
+"""Distributions of the times of a flow-matching loss, which `flow_matching.py` weights."""
 
 from __future__ import annotations
 

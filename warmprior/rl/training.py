@@ -172,7 +172,7 @@ class PriorSpaceTraining:
             "environment": actor.environment,
             "evaluation_seed": evaluation_seed,
             "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
-            "transitions": self._keys,
+            "transitions": self._transition_keys,
         }
         self._state = RunState(self.directory, self.identity)
         #: The path of the training state.
@@ -240,7 +240,7 @@ class PriorSpaceTraining:
                     )
             while self.steps < config.environment_steps:
                 self._switch.learning.fill_(self.steps >= config.warmup_steps)
-                executed = self._keep(next(rounds))
+                executed = self._store(next(rounds))
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
@@ -270,11 +270,12 @@ class PriorSpaceTraining:
     @contextmanager
     def _rounds(self, num_envs: int) -> Iterator[Iterator[TensorDictBase]]:
         """Yield rounds of decisions, each of all environments."""
+        seed = self._collection_seed()
         if self.collect is not None:
-            with self.collect(self._switch, self.make_env, num_envs=num_envs, seed=self._seed()) as rounds:
+            with self.collect(self._switch, self.make_env, num_envs=num_envs, seed=seed) as rounds:
                 yield rounds
             return
-        with self._environment(self._seed()) as env:
+        with self._environment(seed) as env:
             yield self._decisions(env)
 
     def _decisions(self, env: EnvBase) -> Iterator[TensorDictBase]:
@@ -283,7 +284,7 @@ class PriorSpaceTraining:
             decided, data = self._collect(env, data)
             yield decided
 
-    def _seed(self) -> int:
+    def _collection_seed(self) -> int:
         # Not among the seeds of evaluation and demonstrations; a resumed training plays new episodes.
         if self.steps:
             return 1_000_000_000 + 10_000_000 * (self.config.seed % 100) + self.steps % 10_000_000
@@ -297,9 +298,9 @@ class PriorSpaceTraining:
         self._check_finite(data.select(keys.DELTA, keys.CHUNK))
         return env.step_and_maybe_reset(data)
 
-    def _keep(self, data: TensorDictBase) -> int:
+    def _store(self, data: TensorDictBase) -> int:
         """Add decisions to the replay buffer; return the number of their control steps."""
-        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
+        transitions = data.select(*self._transition_keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
         reward = following["reward"].to(torch.get_default_dtype())  # that of the critics
         following["reward"] = reward - self.config.reward_offset * following[keys.EXECUTED]
@@ -328,7 +329,7 @@ class PriorSpaceTraining:
             )
 
     @property
-    def _keys(self) -> list[NestedKey]:
+    def _transition_keys(self) -> list[NestedKey]:
         """Return the stored keys of a transition."""
         states = [self.decoder.observation_key, keys.ANCHOR, *self.decoder.in_keys]
         states = [key for key in dict.fromkeys(states) if key != keys.DELTA]

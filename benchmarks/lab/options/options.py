@@ -29,7 +29,7 @@ from warmprior.options.training import NetworkOptions, TrainingConfig
 if TYPE_CHECKING:
     from lab.methods.methods import Method
 
-STARTS = 10_000
+SEEDS_PER_TRAINING = 10_000
 """The number of simulator seeds that each training seed has for its evaluation episodes."""
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
@@ -85,8 +85,8 @@ class Evaluation:
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
         check_given(self, "nfe", "temperature")
-        if self.episodes > STARTS:
-            raise ValueError(f"--episodes must be at most {STARTS:,}, got {self.episodes}")
+        if self.episodes > SEEDS_PER_TRAINING:
+            raise ValueError(f"--episodes must be at most {SEEDS_PER_TRAINING:,}, got {self.episodes}")
 
     def check(self) -> None:
         """Raise ValueError for temperatures or a grid that policies do not take."""
@@ -105,7 +105,7 @@ class Evaluation:
         tell how far the success rate varies.
         """
         # Simulators take seeds below 2**32.
-        first = EVALUATION_SEED + STARTS * (training_seed % 100_000)
+        first = EVALUATION_SEED + SEEDS_PER_TRAINING * (training_seed % 100_000)
         return range(first, first + self.episodes)
 
     @property

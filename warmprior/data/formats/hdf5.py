@@ -145,17 +145,19 @@ def _check_stored(dataset: h5py.Dataset) -> None:
         if dataset.id.get_offset() is not None:  # a compact one lies in its header
             places.append((dataset.id.get_offset(), stored))
     else:
-        chunk = prod(dataset.chunks) * dataset.dtype.itemsize
-        if chunk > CHUNK_BYTES:
-            raise DatasetError(f"{what} has chunks of {chunk:.1e} bytes: h5repack -l makes smaller ones")
-        steps = list(zip(dataset.shape, dataset.chunks, strict=True))
-        complete = dataset.id.get_num_chunks() >= prod(ceil(n / c) for n, c in steps)
+        chunk_bytes = prod(dataset.chunks) * dataset.dtype.itemsize
+        if chunk_bytes > CHUNK_BYTES:
+            raise DatasetError(
+                f"{what} has chunks of {chunk_bytes:.1e} bytes: h5repack -l makes smaller ones"
+            )
+        dimensions = list(zip(dataset.shape, dataset.chunks, strict=True))
+        complete = dataset.id.get_num_chunks() >= prod(ceil(n / c) for n, c in dimensions)
         if complete:
             parts: dict[tuple[int, ...], tuple[int, int]] = {}
             dataset.id.chunk_iter(lambda p: parts.update({p.chunk_offset: (p.byte_offset, p.size)}))
             places = sorted(parts.values())
             # HDF5 reads a part that is missing in its index as zeros.
-            if not all(start in parts for start in product(*(range(0, n, c) for n, c in steps))):
+            if not all(start in parts for start in product(*(range(0, n, c) for n, c in dimensions))):
                 raise DatasetError(f"{what}: its index of chunks is damaged. {_AGAIN}")
     ends = [*(first for first, _ in places[1:]), dataset.file.id.get_filesize()]
     if any(first + size > end for (first, size), end in zip(places, ends, strict=bool(places))):

@@ -156,8 +156,8 @@ def _metadata(root: Path) -> Any:
             raise DatasetError(f"{root} has no {pattern}; recordings end with finalize(). {again}")
     with reading(f"{root}: LeRobot's meta/", again):
         metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
-    whole = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
-    _check_columns(root, metadata, whole)
+    used = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
+    _check_columns(root, metadata, used)
     numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
     count, frames = metadata.total_episodes, metadata.total_frames
     if not count or numbers != list(range(count)) or steps != frames:
@@ -190,8 +190,8 @@ def _check_info(info: Any) -> str:
         need(f"features.{name}", feature, isinstance(feature, dict))
         dtype, shape = feature.get("dtype"), feature.get("shape")
         need(f"features.{name}.dtype", dtype, isinstance(dtype, str))
-        whole = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
-        need(f"features.{name}.shape", shape, whole)
+        good = isinstance(shape, list) and all(type(size) is int and size >= 0 for size in shape)
+        need(f"features.{name}.shape", shape, good)
         for part, kinds in {"names": (list, dict), "info": (dict,), "video_info": (dict,)}.items():
             value = feature.get(part)
             need(f"features.{name}.{part}", value, value is None or isinstance(value, kinds))
@@ -293,8 +293,8 @@ def read_lerobot_index(
     if recorded:
         _check_actions(root, metadata, recorded, task)
     named = _named_columns(root, metadata.features, widths, described, task)
-    whole = {name: (name, slice(0, width)) for name, width in widths.items() if name != "action"}
-    columns = named | whole
+    vectors = {name: (name, slice(0, width)) for name, width in widths.items() if name != "action"}
+    columns = named | vectors
     if observations is None:
         observations = tuple(named)
         if task is not None:
@@ -374,7 +374,7 @@ def _description(root: Path) -> dict[str, Any]:
         raise DatasetError(f"{path} is from another version: convert the file again, or remove it")
     observations, masks = description.get("observations"), description.get("masks", {})
     for name, value, good in (
-        ("observations", observations, _is_place),
+        ("observations", observations, _is_column_range),
         ("masks", masks, lambda numbers: isinstance(numbers, list)),
     ):
         if not (isinstance(value, dict) and all(map(good, value.values()))):
@@ -383,7 +383,7 @@ def _description(root: Path) -> dict[str, Any]:
     return description
 
 
-def _is_place(value: Any) -> bool:
+def _is_column_range(value: Any) -> bool:
     """Return True if a value names a feature and the columns of an observation there."""
     return isinstance(value, list) and [type(part) for part in value] == [str, int, int]
 

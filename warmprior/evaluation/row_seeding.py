@@ -1,4 +1,4 @@
-"""Seeds of the simulators in a batched environment; `episodes.py` seeds the noise of policies."""
+"""How a row of a batched environment gets the seed of its next episode, which `episodes.py` chooses."""
 
 from __future__ import annotations
 
