@@ -311,8 +311,8 @@ def train(
     """
     from warmprior.data import open_demonstrations
     from warmprior.envs.description import is_registered
-    from warmprior.modules.ode import Sampling
     from warmprior.modules.prior import Prior
+    from warmprior.modules.sampling import Sampling
     from warmprior.tasks import Play, Task
     from warmprior.training import train_policy
     from warmprior.training.cloning import policy_path

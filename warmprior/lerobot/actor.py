@@ -21,8 +21,8 @@ from warmprior.lerobot.names import entry_names
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.generator import Drawing
 from warmprior.modules.network import network_observation
-from warmprior.modules.ode import Sampling
 from warmprior.modules.prior import Prior
+from warmprior.modules.sampling import Sampling
 from warmprior.modules.source import noise_factor
 
 _TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()

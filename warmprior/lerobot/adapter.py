@@ -13,9 +13,8 @@ from warmprior.checks import check_between, check_keys, check_shape, check_whole
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import check_no_noise
 from warmprior.lerobot.source import ChunkSource
-from warmprior.modules.ode import Velocity
 from warmprior.modules.prior import Prior
-from warmprior.modules.real_time_chunking import RealTimeChunking, spliced
+from warmprior.modules.real_time_chunking import RealTimeChunking, Velocity, spliced
 
 
 class RelativeActions:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from warmprior.modules.ode import Velocity
+from warmprior.modules.real_time_chunking import Velocity
 
 Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
 """A function ``(shape [B, T, D], dtype, device) -> a_0`` that replaces a draw."""

@@ -7,10 +7,11 @@ from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.mlp import PlainMLP, VelocityMLP
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import ODEActor, Sampling, integrate
+from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.modules.sampling import Sampling
 from warmprior.modules.source import Source
 from warmprior.modules.transformers import AdaLNTransformer, ChiTransformer
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose, RestingTrend

@@ -23,12 +23,12 @@ from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import USUAL_KEYS, StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork, precision_of, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import Sampling
 from warmprior.modules.preconditioning import SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
+from warmprior.modules.sampling import Sampling
 from warmprior.modules.trend import RestingAction
 from warmprior.saving.checkpoint import as_key, load_state, save_state
 

@@ -90,7 +90,7 @@ class Evaluation:
 
     def check(self) -> None:
         """Raise ValueError for temperatures or a grid that policies do not take."""
-        from warmprior.modules.ode import Sampling
+        from warmprior.modules.sampling import Sampling
 
         with naming("--grid", self.grid):
             Sampling(grid=self.grid)
