@@ -48,3 +48,13 @@ def test_an_average_follows_a_buffer_that_a_network_replaces():
     assert average.module.running.item() == 3.0
     assert network.weight.requires_grad and not average.module.weight.requires_grad
     assert not average.module.training
+
+
+def test_an_average_of_a_norm_without_running_statistics():
+    """Its buffers are there, and None."""
+    network = nn.InstanceNorm2d(2, affine=True)
+    average = ema_of(network, 0.5)
+    for value in (1.0, 2.0):
+        nn.init.constant_(network.weight, value)
+        average.update_parameters(network)
+    assert average.module.weight.tolist() == [1.5, 1.5]

@@ -77,7 +77,8 @@ class _Average(AveragedModel):
             cast(Any, self.multi_avg_fn)(averages, weights, self.n_averaged)
         else:
             torch._foreach_copy_(averages, weights)
-        if owners:  # a forward pass may replace a buffer, so they are collected anew
-            averaged, current = ([b for pair in owners for b in pair[i].buffers(False)] for i in (0, 1))
+        # A forward pass may replace a buffer, so they are collected anew.
+        averaged, current = ([b for pair in owners for b in pair[i].buffers(False)] for i in (0, 1))
+        if averaged:  # those of a norm without running statistics are None
             torch._foreach_copy_(averaged, current)
         self.n_averaged += 1
