@@ -156,7 +156,13 @@ def every_second(tensordict):
     return tensordict[keys.EXECUTED] > 0
 
 
+class Repeats(FrameSkipTransform):
+    """It repeats actions, but not as often as ``frame_skip`` says."""
+
+
 def test_a_chunk_is_not_repeated():
+    env = TransformedEnv(CountingEnv(30), Compose(*policy_transforms(PRIOR), Repeats(1)))
+    refuses(lambda: env.reset(), RuntimeError, "FrameSkipTransform", "before")
     env = TransformedEnv(CountingEnv(30), Compose(*policy_transforms(PRIOR), FrameSkipTransform(2)))
     refuses(lambda: env.reset(), RuntimeError, "FrameSkipTransform", "before")
     for before, after in ([FrameSkipTransform(2)], []), ([], [FrameSkipTransform(1)]):
