@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.lerobot_parts import WIDTHS, edit_table, numbers, write_lerobot
+from tests.data.lerobot_parts import WIDTHS, edit_table, numbers, pq, write_lerobot
 from tests.errors import missing, raises, refuses
 from tests.lerobot.plugin_policies import (
     NEEDS_PLUGIN,
@@ -140,6 +140,11 @@ def test_a_training_says_what_it_uses_of_the_dataset(found, tmp_path, caplog):
     for chosen, unseen in ((None, "task, one of 2 (no option takes it)"), ([0, 2], "nothing")):
         dataset_policy(found, tmp_path / "data", chosen, **sizes)
         assert f"left out      {unseen}" in caplog.messages[-1]
+    rows = pq.read_table(episodes)
+    pq.write_table(rows.drop_columns(["tasks"]), episodes)  # LeRobot trains without them
+    dataset_policy(found, tmp_path / "data", **sizes)
+    assert "left out      nothing" in caplog.messages[-1]
+    pq.write_table(rows, episodes)
     blind = {name: entry for name, entry in seen.items() if "images" not in name}
     dataset_policy(found, tmp_path / "data", input_features=blind)
     for options in ({"image_size": 24}, {"resize": "pad"}, {"crop_size": 8}, {"encoder": "small"}):

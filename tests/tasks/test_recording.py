@@ -123,6 +123,11 @@ def test_a_dataset_of_lerobot_names_its_camera_and_not_its_counters(tmp_path):
     for demos, unseen in ((2, ["task, one of 2"]), (1, [])):
         dataset = open_demonstrations(f"lerobot:{tmp_path / 'arm'}", demos=demos)
         assert Task(dataset).recording.left_out.get("", []) == unseen
+    dataset = open_demonstrations(f"lerobot:{tmp_path / 'arm'}")
+    knowing = Task(dataset, observations=["observation.state", "task_index"])
+    assert "" not in knowing.recording.left_out
+    edit_table(episodes, tasks=lambda tasks: [["lift"], None])
+    assert "" not in Task(dataset).recording.left_out
 
 
 def test_the_parts_of_a_converted_dataset_are_named_once(tmp_path):

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 ROBOT_STATE = "observation.state"
 """LeRobot's name of a robot's joints, or of its other numbers."""
 
@@ -70,7 +72,9 @@ def unseen_tasks(episodes: Iterable[Any]) -> list[str]:
         >>> unseen_tasks([["pick"], ["place"], ["pick"]]), unseen_tasks([["pick"], ["pick"]])
         (['task, one of 2'], [])
     """
-    texts = {str(text) for tasks in episodes for text in (tasks if isinstance(tasks, list) else [tasks])}
+    several = (list, tuple, np.ndarray)  # pandas reads lists of parquet files as arrays
+    listed = (tasks if isinstance(tasks, several) else [tasks] for tasks in episodes)
+    texts = {str(text) for tasks in listed for text in tasks if text is not None}
     return [f"task, one of {len(texts)}"] if len(texts) > 1 else []
 
 

@@ -32,7 +32,8 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
     chosen = range(len(lengths)) if episodes is None else episodes
     seen = {*config.observed, *config.image_features}
     others = [name for name in described if name.startswith("observation") and name not in seen]
-    tasks = dataset_meta.episodes["tasks"]
+    named = "tasks" in dataset_meta.episodes.column_names  # LeRobot trains without them
+    tasks = dataset_meta.episodes["tasks"] if named else [None] * len(lengths)
     left_out = {"input_features": others, "": unseen_tasks(tasks[number] for number in chosen)}
     numbers = {name: number_names(described[name]) for name in (*config.observed, ACTION)}
     meaning = f", absolute targets of {config.joints}" if config.joints not in ("", "auto") else AS_RECORDED

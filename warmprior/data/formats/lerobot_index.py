@@ -96,7 +96,8 @@ class LeRobotIndex(DatasetIndex):
     @override
     def left_out(self) -> dict[str, list[str]]:
         others = super().left_out
-        tasks = unseen_tasks(row.get("tasks") for row in self.episodes)
+        seen = "task_index" in self.observation_keys
+        tasks = [] if seen else unseen_tasks(row.get("tasks") for row in self.episodes)
         return others | {"": [*others.get("", []), *tasks]} if tasks else others
 
     @property
