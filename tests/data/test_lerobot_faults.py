@@ -184,6 +184,11 @@ IMAGES = {
         [MOVIE, "episode 2", "lerobot-edit-dataset"],
         "side_image",
     ),
+    "frames beside the steps": (  # none is missing, but each is 2 ms early
+        table(EPISODES, videosSLASHobservation__images__sideSLASHfrom_timestamp=entry(2, 0.352, None)),
+        [MOVIE, "episode 2", "0.0001 s"],
+        "side_image",
+    ),
 }
 
 

@@ -143,8 +143,8 @@ class LeRobotReader(DemonstrationReader):
             # No frame is near a time; torchcodec's error where the video ends before.
             except (video.FrameTimestampError, IndexError) as error:
                 raise DatasetError(
-                    f"{path} lacks frames of episode {episode['episode_index']}, from {wanted[0]:.2f} to "
-                    f"{wanted[-1]:.2f} s. {_REBUILD}"
+                    f"{path} has no frame within {TOLERANCE:g} s of some steps of episode "
+                    f"{episode['episode_index']}, from {wanted[0]:.2f} to {wanted[-1]:.2f} s. {_REBUILD}"
                 ) from error
 
         return frames
