@@ -7,6 +7,8 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 
+import torch
+
 from warmprior.io.workers import end_with_parent
 
 
@@ -30,6 +32,7 @@ def apart(function):
         def work():
             gc.freeze()  # what has threads, as video decoders have, ends in the process that they are in
             end_with_parent()
+            torch.set_num_threads(1)  # it would wait for those of the process before, which are not here
             try:
                 outcome = function(*args, **kwargs), None
             except BaseException as error:  # pytest's own outcomes included
