@@ -184,6 +184,8 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
         with raises(ValueError, why):
             frozen(words)
     assert len(frozen("")) == 3  # all of its methods
+    # Their training is over: --compile is of the agents', with policies of either kind.
+    assert len(frozen("--compile")) == 3 and read(f"--run {run} --out {out} --compile").run.compile
     # A name in a file is not imported, whichever file says it.
     resumed = json.loads((run / "options.json").read_text())
     resumed["options"]["data"]["task"] = ["evil:task"]

@@ -56,7 +56,6 @@ def parse[O: Options](
             base,
             **{part: getattr(finished_options, part) for part in ("data", "network", "training", "sources")},
             evaluation={"seeds": finished_options.evaluation.seeds},
-            run={"compile": finished_options.run.compile},
         )
     options = read(base, argv, description)
     out = from_leader(lambda: output_folder(options, study))

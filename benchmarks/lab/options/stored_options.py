@@ -65,8 +65,7 @@ def of_run(options: Options, run: Path) -> Options:
             some[part][name] = typed
     stored = with_parts(stored, **some)
     stored_parts: Any = {part: getattr(stored, part) for part in ("data", "network", "training", "sources")}
-    same = with_parts(options, **stored_parts, run={"compile": stored.run.compile})
-    check_same(same, options, f"--run {run} has its own", "leave out --run")
+    check_same(with_parts(options, **stored_parts), options, f"--run {run} has its own", "leave out --run")
     return with_parts(stored, run={"out": run})
 
 
