@@ -1,4 +1,4 @@
-"""How a row of a batched environment gets the seed of its next episode, which `episodes.py` chooses."""
+"""Rows of a batched environment get the seeds of their next episodes, which `episodes.py` chooses."""
 
 from __future__ import annotations
 

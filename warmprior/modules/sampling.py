@@ -1,4 +1,4 @@
-"""How a chunk is drawn: the number of network evaluations, solver, grid, clip and temperature."""
+"""Options for drawing a chunk: network evaluations, solver, grid, clip and temperature."""
 
 from __future__ import annotations
 

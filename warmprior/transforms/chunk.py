@@ -73,7 +73,7 @@ def _descriptions(env: EnvBase) -> list[str]:
 
 
 def _acts_as(part: Transform, kind: type[Transform]) -> bool:
-    """Whether a transform is of a kind and does anything: a ``FrameSkipTransform(1)`` does not."""
+    """Return True if a transform is of a kind and does anything: a ``FrameSkipTransform(1)`` does not."""
     # A subclass may repeat in its own way.
     idle = type(part) is FrameSkipTransform and part.frame_skip == 1
     return isinstance(part, kind) and not idle
