@@ -319,7 +319,13 @@ class _WindowStorage(TensorStorage):
 
     def get(self, index: Any) -> TensorDictBase:
         """Return the windows of some steps."""
-        frame = self.frames[index]
+        drawn = isinstance(index, Tensor) and index.dtype == torch.int64
+        if drawn and index.device == self.frames.device:
+            frame = self.frames.take(index)  # as below, without a tenth of a sample's time
+        else:
+            frame = self.frames[index]
+        if frame.ndim == 1:
+            return self.window._windows(frame)
         return self.window._windows(frame.reshape(-1)).reshape(frame.shape)
 
 
