@@ -125,9 +125,10 @@ class Prior(Registered):
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Check the result of :meth:`Prior.mean`, and return it in the history's dtype."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
-    # A user's own mean may write into what it reads, which the environment keeps.
-    own = type(prior).mean.__module__ != __name__
-    mean, forecast = prior.mean(history.clone() if own else history), history.get("forecast")
+    if type(prior).mean.__module__ == __name__:
+        return prior.mean(history)
+    # A mean of a user's own may write into what it reads, which the environment keeps.
+    mean, forecast = prior.mean(history.clone()), history.get("forecast")
     name = f"{type(prior).__name__}.mean"
     loc, warm = mean if isinstance(mean, tuple) and len(mean) == 2 else (mean, None)
     if getattr(warm, "dtype", None) != torch.bool:
