@@ -1,7 +1,10 @@
 import json
+import os
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -12,6 +15,7 @@ pytest.importorskip("robosuite")
 pytest.importorskip("h5py")
 
 import h5py
+import robosuite
 
 from lab.demonstrations.scripted import generate as generate_module
 from lab.demonstrations.scripted.episode import (
@@ -57,6 +61,7 @@ def masks_of(path):
 
 
 def test_layout_is_robomimics(lift_demonstrations):
+    packages = Path(robosuite.__file__).parents[1]
     with h5py.File(lift_demonstrations) as file:
         data = file["data"]
         demos = sorted(data, key=lambda name: int(name[5:]))
@@ -69,7 +74,9 @@ def test_layout_is_robomimics(lift_demonstrations):
         for name in demos:
             demo = data[name]
             steps = demo.attrs["num_samples"]
-            assert demo.attrs["model_file"].lstrip().startswith("<mujoco")
+            assets = re.findall(r'file="([^"]*)"', demo.attrs["model_file"])
+            assert assets and not any(map(os.path.isabs, assets))
+            assert all((packages / name).exists() for name in assets)
             assert json.loads(demo.attrs["ep_meta"]) == {}
             shapes = {"actions": (steps, 7), "states": (steps, 32), "rewards": (steps,)}
             for key, shape in shapes.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,9 +110,11 @@ def write_robomimic(
 ) -> int:
     """Write episodes to a file that robomimic's reader opens, and return its number of samples.
 
-    ``seed`` seeds the random split into filter keys; ``model_file`` is the simulator's XML.
+    ``seed`` seeds the random split into filter keys; ``model_file`` is the simulator's XML. Its files are
+    named from robosuite's folder on, where robosuite looks for them, so every machine writes the same bytes.
     """
     h5py = require("h5py", "sim")
+    model_file = re.sub(r'file="[^"]*/robosuite/', 'file="robosuite/', model_file)
     steps: list[int] = []
     levels: list[str] = []
 
