@@ -148,9 +148,18 @@ def _encoded(
 
 def precision_of(module: nn.Module) -> torch.dtype | None:
     """Return the precision of a module's weights, or ``None`` if it has none."""
-    # A frozen network has only buffers.
-    values = chain(module.parameters(), module.buffers())
-    return next((value.dtype for value in values if value.is_floating_point()), None)
+    return _precision(module, "_parameters") or _precision(module, "_buffers")  # if it is frozen
+
+
+def _precision(module: nn.Module, kind: str) -> torch.dtype | None:
+    # Not parameters(), whose names and sets take a twentieth of a decision.
+    for value in getattr(module, kind).values():
+        if value is not None and value.is_floating_point():
+            return value.dtype
+    for part in module._modules.values():
+        if part is not None and (found := _precision(part, kind)):
+            return found
+    return None
 
 
 def device_of(module: nn.Module, data: Tensor | TensorDictBase | None = None) -> torch.device:
