@@ -13,6 +13,7 @@ from lab.speed.training import default_network
 from warmprior import PriorAnchor, WarmPriorActor, keys, policy_transforms
 from warmprior.envs import RobosuiteEnv
 from warmprior.evaluation import parallel_env
+from warmprior.io.workers import torch_threads
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.rl.improve import SMALL
 
@@ -22,6 +23,7 @@ ENVIRONMENTS, DECISIONS = 4, 5
 def learning_over_environments(clock: Clock) -> float:
     """Four simulators of square in worker processes, and the compiled updates of ``SMALL``."""
     torch.manual_seed(0)
+    threads = torch.get_num_threads()  # as PriorSpaceTraining, whose updates take those of waiting workers
     policy = WarmPriorActor(default_network(), PRIOR, nfe=1).eval()
     workers = parallel_env(partial(RobosuiteEnv, "square"), partial(policy_transforms, policy), ENVIRONMENTS)
     env = TransformedEnv(workers, PriorAnchor(policy))
@@ -43,7 +45,8 @@ def learning_over_environments(clock: Clock) -> float:
             with torch.no_grad():
                 decided, after = env.step_and_maybe_reset(agent.policy(after.exclude(keys.CHUNK)))
             buffer.extend(decided)
-            agent.learn(buffer)
+            with torch_threads(threads):
+                agent.learn(buffer)
 
     ratio = clock.ratio(alone, learning)
     env.close(raise_if_closed=False)
