@@ -24,7 +24,7 @@ torch.manual_seed(0)
 # %%
 # A grid, side by side
 # --------------------
-# Every benchmark trains and evaluates in worker processes, as many as ``--envs`` says (one per core by
+# Every benchmark trains and evaluates in worker processes, as many as ``--workers`` says (one per core by
 # default). A worker takes one job after another and computes with one thread. Here are the toy's
 # policies from two sources, with a small network and two seeds. The script is found from the folder of this
 # tutorial, ``docs/tutorials`` of a checkout: start it there.
@@ -34,17 +34,19 @@ script = Path("../../benchmarks/navigation1d.py")
 small = "--prior gaussian past --sigma 0.1 --hidden-dim 64 --iterations 300 --nfe 3 --logger none"
 
 
-def compare(run, seeds, envs):
+def compare(run, seeds, workers):
     """The rows of a comparison on the toy, and what it printed."""
     out = Path(folder.name) / run
-    options = f"{small} --seeds {seeds} --envs {envs} --out {out}".split()
+    options = (
+        f"{small} --seeds {seeds} --workers {workers} --out {out}".split()
+    )
     command = [sys.executable, str(script), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     lines = (out / "results.jsonl").read_text().splitlines()
     return [json.loads(line) for line in lines], done.stdout
 
 
-rows, _ = compare("grid/two_seeds", seeds=2, envs=2)
+rows, _ = compare("grid/two_seeds", seeds=2, workers=2)
 for row in rows:
     print(row["policy"], row["collision_rate"])
 
@@ -57,7 +59,7 @@ for row in rows:
 policies = Path(folder.name) / "grid" / "policies"
 saved = {path: path.stat().st_mtime_ns for path in policies.glob("*/state*")}
 
-more, _ = compare("grid/three_seeds", seeds=3, envs=2)
+more, _ = compare("grid/three_seeds", seeds=3, workers=2)
 for path in sorted(policies.glob("*/state*")):
     kept = saved.get(path) == path.stat().st_mtime_ns
     print(path.parent.name, "as it was" if kept else "new")
@@ -72,7 +74,7 @@ for path in sorted(policies.glob("*/state*")):
 # weights would differ in the last bits, and so would the policies' actions.
 # :func:`~warmprior.saving.load_policy` reads both.
 
-alone, _ = compare("alone/run", seeds=1, envs=1)
+alone, _ = compare("alone/run", seeds=1, workers=1)
 print("the same rows:", alone == [row for row in more if row["seed"] == 0])
 for row in alone:
     places = [policies, Path(folder.name) / "alone" / "policies"]

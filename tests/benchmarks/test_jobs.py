@@ -57,7 +57,7 @@ def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys, f
     for name in ("out", "policies"):
         (tmp_path / name).mkdir()
     found = {}
-    with Jobs(Run(out=tmp_path / "out", envs=1, engine=engine)) as pool:
+    with Jobs(Run(out=tmp_path / "out", workers=1, engine=engine)) as pool:
         for n in range(5):
             group = f"policy {n}"
             trained = pool.submit(f"train {n}", train, tmp_path, n, group=group, training=True)
@@ -113,7 +113,7 @@ def test_the_last_trainings_start_before_episodes_and_an_error_kills_the_workers
 
 
 def sleeping():
-    with Jobs(Run(envs=1)) as pool:
+    with Jobs(Run(workers=1)) as pool:
         for i in range(2):
             pool.submit(f"sleep {i}", time.sleep, 60)
         print("ready", flush=True)
@@ -174,7 +174,7 @@ def test_without_a_terminal_trainings_say_now_and_then_how_far_they_are(tmp_path
     monkeypatch.setattr(jobs, "LINES_EVERY", -1)
     status = tmp_path / "status.json"
     running = [jobs.Job("train square", play, (), status=status), jobs.Job("play square", play, ())]
-    with Jobs(Run(envs=1)) as started, jobs.tqdm(disable=True) as bar:
+    with Jobs(Run(workers=1)) as started, jobs.tqdm(disable=True) as bar:
         started._show(bar, running)
         for text in ('{"iteration": 1, "iter', "3", '{"iteration": 1}', '{"iteration": 1, "iterations": 0}'):
             status.write_text(text)

@@ -72,8 +72,8 @@ def test_a_run_continues_with_its_options_and_refuses_others(tmp_path, monkeypat
         raise RuntimeError("killed")
     monkeypatch.chdir("/")  # a relative path is that of the same file
     # Who computes is no part of a run, and to repeat an option does no harm.
-    again = read(*resume, "--envs", 3, out=out)
-    assert replace(again, run=first.run) == first and again.data.dataset == file and again.run.envs == 3
+    again = read(*resume, "--workers", 3, out=out)
+    assert replace(again, run=first.run) == first and again.data.dataset == file and again.run.workers == 3
     for words, changed in (("--seed 4", "--seed"), ("--compile --seeds 2", "--compile, --seeds")):
         with raises(ValueError, changed):
             read(*resume, *words.split(), out=out)
@@ -131,7 +131,7 @@ def test_each_training_seed_has_start_states_of_its_own():
 
 
 def test_counts_that_could_not_be_listed(tmp_path):
-    for option in ("demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "envs"):
+    for option in ("demonstrations", "image-size", "episodes", "seeds", "chunk", "nfe", "workers"):
         with raises(ValueError, f"--{option}", "10,000,000", 10**23):
             read(f"--{option}", 10**23, out=tmp_path)
 
@@ -146,7 +146,7 @@ def test_demonstrations_are_generated_by_no_more_processes_than_asked_for(tmp_pa
     monkeypatch.setattr(generate, "working", working)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(3))
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
-    argv = ["--task", "lift", "--demonstrations", "5", "--envs", "1", "--out", str(tmp_path / "out")]
+    argv = ["--task", "lift", "--demonstrations", "5", "--workers", "1", "--out", str(tmp_path / "out")]
     assert "that is all" in refused(robomimic.main, argv, capsys)
     assert asked == [1] and "LOKY_MAX_CPU_COUNT" not in os.environ
 

@@ -50,7 +50,7 @@ def test_rows_have_an_order_and_do_not_depend_on_who_computes(
     assert cells == list(product(("gaussian", "past"), (0, 1), (10, 20), (3, 1)))
     # In two processes: there the episodes come in another order. Fresh ones are in test_tasks.py.
     monkeypatch.setattr(jobs, "Local", inline)
-    assert apart(robomimic.main)(arguments(tmp_path / "out", prior="past", envs=2)) == 0
+    assert apart(robomimic.main)(arguments(tmp_path / "out", prior="past", workers=2)) == 0
     assert untimed(tmp_path / "out") == untimed(finished)
 
 
@@ -111,7 +111,7 @@ def test_a_run_continues_with_what_is_missing(finished, tmp_path, capsys):
     whole, before = stored(path.parent), written(tmp_path)
     kept = [row | {"mean_steps": 12_345.0} for row in whole[2:5]]
     path.write_text("".join(json.dumps(row) + "\n" for row in kept))
-    assert robomimic.main([*argv, "--resume", "--envs", "3"]) == 0
+    assert robomimic.main([*argv, "--resume", "--workers", "3"]) == 0
     assert stored(path.parent) == [*whole[:2], *kept, *whole[5:]]
     assert written(tmp_path) == before
     # Rows of other policies are named.

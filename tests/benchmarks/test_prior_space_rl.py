@@ -17,7 +17,7 @@ from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
 from warmprior.envs.description import registered_description
 from warmprior.rl import has_anchor
 
-TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
+TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "workers": 1}
 TINY |= {"centre": "mean", "delta": 0.5, "rl__hidden_dim": 16}
 SHORT = {"rl__environment_steps": 500, "rl__warmup_steps": 200, "rl__evaluate_every": 300}
 BOTH = ("dsrl-na", "dsrl-sac")

@@ -215,7 +215,7 @@ def test_navigation_has_its_own_columns_and_pictures(preset, priors, tmp_path, c
     out = tmp_path / "runs" / "out"
     few = {"prior": priors, "iterations": 5, "episodes": 4, "chunk": 32}
     few |= {"preset": preset, "seeds": 1, "hidden_dim": 8}
-    argv = command_line(**few, envs=1, logger="none", out=out)
+    argv = command_line(**few, workers=1, logger="none", out=out)
     assert navigation1d.main(argv) == 0
     played, curved = stored(out), stored(out, "curvature")
     policies = {(row["prior"], row["sigma"]) for row in played}
@@ -242,7 +242,7 @@ def test_navigation_has_its_own_columns_and_pictures(preset, priors, tmp_path, c
     assert stored(out) == played and written(out.parent) == before
 
 
-TINY = {"iterations": 20, "episodes": 2, "envs": 1, "nfe": 2, "logger": "none", "hidden_dim": 16}
+TINY = {"iterations": 20, "episodes": 2, "workers": 1, "nfe": 2, "logger": "none", "hidden_dim": 16}
 
 
 def test_real_time_chunking_of_a_task_beside_the_toy(dataset, tmp_path):

@@ -119,7 +119,7 @@ class Run:
 
     out: Path | None = None  # output folder (default: a numbered folder under runs/)
     resume: bool = False  # continue the run in --out, or the latest numbered folder, with its options
-    envs: int | None = None  # worker processes, which change no result (default: one per core)
+    workers: int | None = None  # processes, which change no result (default: one per core)
     device: str = "cpu"  # device of networks and data, such as cuda; under torchrun each process has its own
     videos: bool = True  # save a filmstrip and a video of one episode per method
     compile: bool = False  # use torch.compile in training
@@ -128,7 +128,7 @@ class Run:
     ray_address: str | None = None  # HOST:PORT of the Ray head (default: $RAY_ADDRESS, else this machine)
 
     def __post_init__(self) -> None:
-        check_counts(self, "envs")
+        check_counts(self, "workers")
         if self.ray_address is not None and self.engine != "ray":
             raise ValueError("--ray-address belongs to --engine ray: add it, or leave --ray-address out")
         if self.engine == "ray" and launched():

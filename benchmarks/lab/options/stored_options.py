@@ -14,7 +14,7 @@ from lab.demonstrations.data_options import resolved_place
 from lab.options.options import Options, with_parts
 from warmprior.io.files import read_json
 
-OF_A_START = ("out", "resume", "envs", "videos", "logger", "engine", "ray_address")
+OF_A_START = ("out", "resume", "workers", "videos", "logger", "engine", "ray_address")
 """Options that may differ each time a run is started, because they change no result."""
 
 

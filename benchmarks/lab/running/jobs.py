@@ -132,9 +132,9 @@ class Ray:
 
         self._device = run.device
         folders = [] if run.out is None else [run.out, run.policies]
-        self._connection = ray_cluster(run.ray_address, run.envs, folders)
+        self._connection = ray_cluster(run.ray_address, run.workers, folders)
         self._ray = self._connection.__enter__()
-        self.workers = run.envs or int(self._ray.cluster_resources().get("CPU", 1))
+        self.workers = run.workers or int(self._ray.cluster_resources().get("CPU", 1))
         self._task = self._ray.remote(call)
         self._running: dict[Future[Any], Any] = {}
 
@@ -166,7 +166,7 @@ class Jobs:
 
     def __init__(self, run: Run) -> None:
         # The future of `submit` raises if the worker dies.
-        self.engine: Local | Ray = Ray(run) if run.engine == "ray" else Local(run.envs, run.device)
+        self.engine: Local | Ray = Ray(run) if run.engine == "ray" else Local(run.workers, run.device)
         self._waiting: list[Job] = []
         self._failed: dict[str, str] = {}  # reasons by group
         self._spoke = time.monotonic()
@@ -238,7 +238,7 @@ class Jobs:
                 return 0
             result, kind = None, type(error).__name__
             reason = f"its worker died {job.deaths} times ({kind}), perhaps for lack of memory: use fewer "
-            reason += "workers with --envs"
+            reason += "--workers"
         if reason is None:
             job.done = True
             if job.then is not None:
