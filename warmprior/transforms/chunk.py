@@ -32,9 +32,9 @@ from warmprior.transforms.normalize import FloatNorm, FloatScaling
 from warmprior.transforms.restarts import flat
 from warmprior.transforms.stack import ObservationStack
 
-How = Literal["max", "sum", "last"]
+Combination = Literal["max", "sum", "last"]
 
-Measures = Mapping[str, How]
+Measures = Mapping[str, Combination]
 """A mapping from an environment's keys to the way in which a chunk, and an episode, combine their values."""
 
 
@@ -45,7 +45,7 @@ def check_measures(measures: Measures) -> None:
             f"measures must say how each is combined, as {{'reward': 'max'}} does, got {measures}"
         )
     for key, how in measures.items():
-        check_choice(f"the measure {key!r}", how, get_args(How))
+        check_choice(f"the measure {key!r}", how, get_args(Combination))
 
 
 _PER_STEP = {AbsoluteActions, ActionScaling, CameraImages, FloatNorm, FloatScaling, ObservationNorm}
