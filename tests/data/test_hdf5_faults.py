@@ -160,6 +160,37 @@ def test_values_that_no_robot_has(square_file, key, value):
     unreadable(path, f"data/demo_2/{key}", "row 17", steps={})
 
 
+OFFSETS = {"metres of a map": (5.4e6, 0.05), "ticks": (10**8, 3), "seconds": (2e8, 0.05)}
+
+
+@pytest.mark.parametrize("name", OFFSETS)
+@pytest.mark.parametrize("key", ["actions", "obs/object"])
+def test_large_numbers_whose_steps_float32_would_lose(square_file, key, name):
+    path, _ = square_file
+    offset, step = OFFSETS[name]
+
+    def write(values):
+        with h5py.File(path, "a") as file:
+            for demo in file["data"].values():
+                column = values(np.arange(len(demo["actions"])))
+                old = demo[key][()].astype(column.dtype)
+                old[:, 2] = column
+                replace(demo, key, old)
+
+    write(lambda t: offset + step * t)
+    facts = "column 2", f"{np.spacing(np.float32(offset)):g}", "offset"
+    unreadable(path, f"data/demo_0/{key}", *facts, steps={"actions": "stored"})
+    # Without the offset, in large steps, at rest, or as they were recorded in float32.
+    for values in (
+        lambda t: step * t,
+        lambda t: offset + 1000 * step * t,
+        lambda t: np.full(len(t), offset + 0.3),
+        lambda t: (offset + step * t).astype(np.float32),
+    ):
+        write(values)
+        RobomimicDemonstrations(path).steps(actions="stored")
+
+
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0.9, 0, 0, 0)])
 def test_absolute_actions_need_unit_quaternions(square_file, quaternion):
     path, _ = square_file

@@ -26,6 +26,9 @@ from warmprior.envs.robosuite_tasks import TaskSpec
 from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
+LARGE = 1e5
+"""The size from which on numbers may have an offset that takes the precision of their steps."""
+
 MISFIT = "They do not fit these actions: correct one or the other."
 
 
@@ -225,4 +228,19 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, fir
     usable = np.abs(out) <= LARGEST  # False for NaN
     if not usable.all():
         value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
-        raise DatasetError(f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g}. {advice}")
+        raise DatasetError(
+            f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g} (of time stamps, those "
+            f"since the first). {advice}"
+        )
+
+
+def check_kept(exact: np.ndarray, kept: np.ndarray, what: str) -> None:
+    """Raise DatasetError if float32 changes a tenth of how numbers ``[N, d]`` differ from row to row."""
+    changes, steps = (np.square(np.diff(rows, axis=0)).sum(0) for rows in (kept - exact, exact))
+    if (lost := changes > 0.01 * steps).any():
+        column = int(lost.argmax())
+        largest = np.abs(kept[:, column]).max()
+        raise DatasetError(
+            f"{what} has numbers up to {largest:g} in column {column}, where those of float32 are "
+            f"{np.spacing(largest):g} apart, too coarse for their steps: subtract an offset, or leave it out"
+        )
