@@ -25,6 +25,11 @@ def _no_demos(file, folder):
         del file["data"][name]
 
 
+def _two_rewards(file, folder):
+    for name, demo in file["data"].items():
+        replace(file, f"data/{name}/rewards", np.zeros((len(demo["actions"]), 2)))
+
+
 ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
@@ -42,6 +47,7 @@ OTHERS = {
     "no key": (lambda f, folder: f.pop(OBJECT), ["data/demo_1", "'object'", "robot0_eef_pos"]),
     "short object": (replaced("obs/object", np.zeros((4, 14))), [OBJECT, "(4, 14)", "5 rows"]),
     "wide actions": (replaced("actions", np.zeros((5, 8))), [ACTIONS, "(5, 8)", "NutAssemblySquare", 7]),
+    "two rewards": (_two_rewards, ["data/demo_0/rewards", "(12, 2)"]),
     "text": (replaced("obs/object", np.array([b"a"] * 5)), [OBJECT, "numbers"]),
 }
 NAMED = {
@@ -70,7 +76,7 @@ def test_what_does_not_fit_is_refused_by_name(square_file, tmp_path, name):
     change, facts = OTHERS[name]
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
-    unreadable(path, *facts)
+    unreadable(path, *facts, steps={})
 
 
 @pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])

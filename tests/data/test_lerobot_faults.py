@@ -9,6 +9,8 @@ import torch
 
 pytest.importorskip("lerobot")
 
+import av
+
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from tests.errors import raises, refuses
@@ -66,6 +68,20 @@ def entry(row, value, column=2):
         return values
 
     return change
+
+
+def sound(root):
+    with av.open(root / MOVIE, "w") as file:
+        stream = file.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        file.mux([*stream.encode(frame), *stream.encode()])
+
+
+def unknown_codec(root):
+    content = (root / MOVIE).read_bytes()
+    assert b"av01" in content
+    (root / MOVIE).write_bytes(content.replace(b"av01", b"none"))
 
 
 def description(content):
@@ -133,6 +149,7 @@ META = {
     "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), PLACED),
     "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json", "masks"]),
     "no JSON": (cut("meta/info.json"), ["LeRobot"]),
+    "no steps": (table(EPISODES, length=lambda lengths: [7, 0, 9]), ["without steps"]),
     "no episodes": (without(EPISODES), ["meta/episodes/*/*.parquet", "finalize()"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps", 30, "Lift", 20]),
     "no action": (
@@ -155,6 +172,10 @@ META = {
 VALUES = {
     "cut off": (cut(DATA), ["damaged", "finalize()"]),
     "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
+    "dropped frames": (
+        table(DATA, timestamp=entry(slice(12, 16), [1.0] * 4, None)),
+        ["episode 2", "row 4", 20],
+    ),
     "other episodes": (table(DATA, episode_index=entry(6, 0, None)), ["meta/episodes", "finalize()"]),
 }
 ELSEWHERE = {
@@ -175,6 +196,8 @@ IMAGES = {
         "agentview_image",
     ),
     "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
+    "sound": (sound, [MOVIE, "observation.images.side", "codec", "audio"], "side_image"),
+    "unknown codec": (unknown_codec, [MOVIE, "observation.images.side", "codec"], "side_image"),
     "outside": (
         info_of("data_path", "../{chunk_index}/{file_index}.parquet"),
         ["'../0/0.parquet'", "folder"],

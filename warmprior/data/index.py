@@ -93,8 +93,11 @@ class DatasetIndex:
     joints: str = ""
 
     def __post_init__(self) -> None:
-        if not self.demos:
-            raise DatasetError(f"{self.path}: no demonstrations are chosen; the mask names none")
+        if not self.demos or not all(self.lengths):
+            what = (
+                "a demonstration without steps" if self.demos else "no demonstrations, or the mask names none"
+            )
+            raise DatasetError(f"{self.path}: there is {what}: choose others")
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
@@ -223,7 +226,7 @@ def pose_keys(action_dim: int) -> list[str]:
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, first: int = 0) -> None:
     """Copy numbers to ``out``; raise DatasetError if one is not finite there, or above 1e9."""
-    with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
+    with reading(what, advice), np.errstate(over="ignore"):  # an overflow is infinite: reported below
         out[...] = block.reshape(out.shape)
     usable = np.abs(out) <= LARGEST  # False for NaN
     if not usable.all():
