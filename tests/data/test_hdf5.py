@@ -169,6 +169,7 @@ def test_what_is_no_file_or_not_whole(square_file, tmp_path):
     for place, error in ((tmp_path / "absent.hdf5", FileNotFoundError), (tmp_path, IsADirectoryError)):
         with raises(error, place):
             RobomimicDemonstrations(place).index()
+        refuses(RobomimicDemonstrations(place).check, FileNotFoundError, place)
     whole = path.read_bytes()
     parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
     far = whole[:50] + bytes(6) + whole[56:]  # the undefined address of the driver becomes 65,535

@@ -1,6 +1,7 @@
 """HDF5 files that point elsewhere, declare what they do not hold, or hold what no robot could."""
 
 import json
+import os
 import struct
 
 import h5py
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from tests.data.hdf5_faults import FAULTS, damage_heap, replace, unreadable
+from tests.errors import refuses
 from tests.fuzz import sandbox
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.heaps import open_checked
 
 
 def replaced(name, value):
@@ -34,6 +37,7 @@ ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
     "dataset for observations": (replaced("obs", np.zeros(3)), ["data/demo_1/obs", "dataset", "group"]),
+    "link to nothing": (replaced("", h5py.SoftLink("/nothing")), ["data/demo_1"]),
     "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
     "type": (
         env_args(json.dumps({"env_name": "Lift", "type": {}, "env_kwargs": {}})),
@@ -140,6 +144,27 @@ def test_a_heap_of_strings_over_which_hdf5_walks_for_ever(square_file, monkeypat
     found = sandbox.attempt(RobomimicDemonstrations(path, mask=mask).steps, str(path))
     assert found.kind == "refused", found
     assert "heap" in found.detail
+
+
+@pytest.mark.parametrize("part", ["string", "heap"])
+def test_a_heap_that_is_damaged_or_longer_than_the_file(square_file, part):
+    path, _ = square_file
+    if part == "string":
+        damage_heap(path, part, 2**64 - 16)
+    else:
+        content = bytearray(path.read_bytes())
+        heap = content.rindex(b"GCOL")
+        content[heap + 8 : heap + 16] = (2**40).to_bytes(8, "little")
+        path.write_bytes(content)
+    unreadable(path, "heap")
+
+
+def test_a_file_that_is_cut_off_while_it_is_read(square_file):
+    path, _ = square_file
+    with open_checked(path) as file:
+        actions = file["data/demo_2/actions"]
+        os.truncate(path, actions.id.get_offset() + 8)
+        refuses(lambda: actions[()], OSError, "ends early")
 
 
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):

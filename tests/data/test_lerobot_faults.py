@@ -139,6 +139,10 @@ META = {
     "a number of a camera": (info_of("video_path", "{video_key:03d}"), ["video_path="]),
     "other counts": (info_of("total_frames", 99), ["meta/info.json", 99, "meta/episodes"]),
     "another version": (described(format=2), ["warmprior.json", "version"]),
+    "narrow state": (
+        feature("observation.state", shape=[8], names=None),
+        ["Lift", "'observation.state': 8", 9],
+    ),
     "narrow actions": (feature("action", shape=[6], names=None), ["'action'", 6, "Lift", 7]),
     "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),
     "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
@@ -277,7 +281,9 @@ def test_observations_that_are_no_vectors_are_named(root, dtype, shape):
         LeRobotDemonstrations(root).steps(observations=["observation.state"])
 
 
-def test_bad_options(root):
+def test_bad_options(root, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
+    refuses(lambda: LeRobotDemonstrations("user/arm").index(), OSError, "user/arm", "v3.0", "connection")
     refuses(lambda: LeRobotDemonstrations(root).steps(storage="disk"), ValueError, "'disk'")
     refuses(lambda: LeRobotDemonstrations(root / "absent").steps(), FileNotFoundError, "meta/info.json")
     refuses(lambda: LeRobotDemonstrations(root, demos=4).steps(), DatasetError, 3, "demos=4")
