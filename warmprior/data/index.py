@@ -95,7 +95,7 @@ class DatasetIndex:
     def __post_init__(self) -> None:
         if not self.demos or not all(self.lengths):
             what = (
-                "a demonstration without steps" if self.demos else "no demonstrations, or the mask names none"
+                "a demonstration without steps" if self.demos else "no demonstration, or the mask names none"
             )
             raise DatasetError(f"{self.path}: there is {what}: choose others")
         if not self.observation_keys:
