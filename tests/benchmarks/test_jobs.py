@@ -1,6 +1,7 @@
 """Jobs on fake work: order, failures, dead workers, killed drivers; on this machine and on Ray."""
 
 import functools
+import importlib
 import multiprocessing
 import os
 import re
@@ -11,13 +12,16 @@ import time
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+import robomimic
 
 from lab.options.options import Run
-from lab.running import jobs
+from lab.running import jobs, pictures
 from lab.running.jobs import Jobs
 from tests.benchmarks.conftest import Inline
+from tests.benchmarks.script_parts import options, stored
 from tests.errors import raises
 from tests.processes import apart
 from warmprior.io.script import run_script
@@ -196,3 +200,56 @@ def test_what_waits_for_a_failed_job_is_left_out_whatever_its_group(monkeypatch,
 
 def fail():
     raise ValueError("no such loss")
+
+
+def resumed(out, argv):
+    """Run a command line on what an earlier call left, with a log."""
+    resume = ["--resume"] if (out / "options.json").exists() else []
+    with (out.parent / "log.txt").open("a", buffering=1) as log:
+        os.dup2(log.fileno(), 1), os.dup2(log.fileno(), 2)
+        sys.stdout = sys.stderr = log
+        sys.exit(robomimic.main([*argv, *resume]))
+
+
+def results(out):
+    rows = [row | {"training_seconds": None} for row in stored(out)]
+    files = sorted(out.parent.glob("policies/*/policy_*/model.safetensors"))
+    return rows, {str(path.relative_to(out.parent)): path.read_bytes() for path in files}
+
+
+KILLS = int(os.environ.get("KILLS", "20"))
+"""How often a run is killed; more in a search for rare moments."""
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(
+    dataset, tmp_path, monkeypatch, forked_workers
+):
+    """SIGKILL for a driver and its worker, while they start, train, save, measure, play and write."""
+    monkeypatch.setattr(pictures, "rendering_backend", lambda: None)
+    for module in ("lab.running.comparison", "lab.running.policies", "lab.reporting.report", "robosuite"):
+        importlib.import_module(module)  # what is imported here costs the forks no time
+    few = {"iterations": 60, "save_every": 4, "checkpoints": 2, "episodes": 2, "prior": "past"}
+    rng, kills, runs, duration, expected = np.random.default_rng(0), 0, 0, np.inf, None
+    while kills < KILLS:
+        out, code, runs = tmp_path / str(runs) / "out", None, runs + 1
+        most = 0 if expected is None else min(KILLS, kills + 10)  # the first run is undisturbed
+        out.parent.mkdir()
+        while code is None:
+            begun, is_fresh = time.monotonic(), not out.exists()
+            argv = [*options(dataset, out, **few), "--no-videos"]
+            process = multiprocessing.get_context("fork").Process(target=resumed, args=(out, argv))
+            process.start()
+            os.setpgid(process.pid, process.pid)
+            process.join(None if kills == most else rng.uniform(0, 0.9) * duration)
+            if (code := process.exitcode) is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.join()
+                kills += 1
+        log = (out.parent / "log.txt").read_text()
+        assert code == 0, f"after {kills} kills:\n{log}"
+        if is_fresh:  # other work may have slowed the first run
+            duration = min(duration, time.monotonic() - begun)
+        expected = expected or results(out)
+        assert results(out) == expected, log
+        assert [len(part) for part in expected] == [2, 2]

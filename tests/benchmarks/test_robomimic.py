@@ -6,12 +6,9 @@ import sys
 import time
 
 import navigation1d
-import numpy as np
 import psutil
 import pytest
 import robomimic
-import torch
-from safetensors.torch import load_file
 
 from lab.options.command_line import parse, started
 from lab.options.presets import PRESETS
@@ -79,58 +76,6 @@ def test_default_folders_are_numbered_past_the_latest(tmp_path, monkeypatch):
     assert str(read().run.out) == "runs/can-ph-quick-3"
     assert str(read("--resume").run.out) == "runs/can-ph-quick-2"
     assert str(read("--task", "can", "stack", "--preset", "cpu").run.out) == "runs/can-stack-ph-cpu"
-
-
-@pytest.mark.slow  # a quarter of an hour
-def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(dataset, tmp_path):
-    """SIGKILL at 20 moments: while it starts, trains, saves, measures, plays and writes."""
-
-    def launch(out):
-        few = {"iterations": 600, "save_every": 20, "checkpoints": 2, "episodes": 2, "prior": "past"}
-        argv = [*options(dataset, out, **few), "--no-videos"]
-        argv += ["--resume"] if (out / "options.json").exists() else []
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with log(out).open("a") as written:
-            pipes = {"stdout": written, "stderr": subprocess.STDOUT, "start_new_session": True}
-            return subprocess.Popen([sys.executable, robomimic.__file__, *argv], **pipes)
-
-    def log(out):
-        return out.parent / "log.txt"
-
-    def results(out):
-        rows = [row | {"training_seconds": None} for row in stored(out)]
-        files = sorted(out.parent.glob("policies/*/policy_*/model.safetensors"))
-        return rows, {str(path.relative_to(out.parent)): load_file(path) for path in files}
-
-    undisturbed = tmp_path / "undisturbed" / "out"
-    begun = time.monotonic()
-    assert launch(undisturbed).wait() == 0, log(undisturbed).read_text()
-    duration = time.monotonic() - begun
-    rows, weights = results(undisturbed)
-    assert len(rows) == len(weights) == 2
-    rng, kills, runs = np.random.default_rng(0), 0, 0
-    out = tmp_path / "0" / "out"
-    while True:
-        begun, is_fresh = time.monotonic(), not out.exists()
-        process = launch(out)
-        try:
-            code = process.wait(None if kills == 20 else rng.uniform(0.1, 0.9) * duration)
-            assert code == 0, f"after {kills} kills:\n{log(out).read_text()}"
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            assert process.wait() == -signal.SIGKILL
-            kills += 1
-            continue
-        if is_fresh:  # other work may have slowed the undisturbed run
-            duration = min(duration, time.monotonic() - begun)
-        mine, theirs = results(out)
-        assert mine == rows and theirs.keys() == weights.keys()
-        for name, policy in weights.items():
-            assert all(torch.equal(theirs[name][key], value) for key, value in policy.items())
-        if kills == 20:
-            break
-        runs += 1
-        out = tmp_path / str(runs) / "out"
 
 
 @pytest.mark.slow

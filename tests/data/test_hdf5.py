@@ -30,6 +30,12 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     assert RobomimicDemonstrations(path, demos=11).index().demos == tuple(f"demo_{n}" for n in range(11))
     assert RobomimicDemonstrations(path, demos=2, mask="late").index().demos == ("demo_3", "demo_10")
     unreadable(path, 12, "demos=13", demos=13)
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["total"]
+        for name in "demo_01", "demo_001", "demo_0001":
+            file.copy("data/demo_1", f"data/{name}")
+    equal = ("demo_0001", "demo_001", "demo_01", "demo_1")
+    assert RobomimicDemonstrations(path, demos=5).index().demos == ("demo_0", *equal)
     refuses(lambda: RobomimicDemonstrations(path, demos=0).index(), ValueError, "demos", 0)
 
 
@@ -140,13 +146,17 @@ def test_a_demo_that_the_file_counts_and_does_not_hold(square_file):
     path, _ = square_file
     with h5py.File(path, "a") as file:
         del file["data/demo_1"]
-    unreadable(path, "data.attrs['total'] counts 47", "demos have 42")
+    unreadable(path, "data.attrs['total'] counts 47", 42)
     assert (
         len(RobomimicDemonstrations(path, mask="train").index().demos)
         == len(RobomimicDemonstrations(path, demos=2).index().demos)
         == 2
     )
     with h5py.File(path, "a") as file:
+        file["data/demo_0"].attrs["num_samples"] = 10  # the others are padding
+    unreadable(path, "data/demo_0.attrs['num_samples'] counts 10", 12, demos=1)
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0"].attrs["num_samples"]
         file["data"].attrs["total"] = "many"
     unreadable(path, "data.attrs['total']")
     with h5py.File(path, "a") as file:
@@ -159,6 +169,7 @@ def test_what_is_no_file_or_not_whole(square_file, tmp_path):
     for place, error in ((tmp_path / "absent.hdf5", FileNotFoundError), (tmp_path, IsADirectoryError)):
         with raises(error, place):
             RobomimicDemonstrations(place).index()
+        refuses(RobomimicDemonstrations(place).check, FileNotFoundError, place)
     whole = path.read_bytes()
     parts = [whole[: int(keep * len(whole))] for keep in (0.0, 0.001, 0.5, 0.99)]
     far = whole[:50] + bytes(6) + whole[56:]  # the undefined address of the driver becomes 65,535

@@ -1,6 +1,7 @@
 """HDF5 files that point elsewhere, declare what they do not hold, or hold what no robot could."""
 
 import json
+import os
 import struct
 
 import h5py
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 
 from tests.data.hdf5_faults import FAULTS, damage_heap, replace, unreadable
+from tests.errors import refuses
 from tests.fuzz import sandbox
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
+from warmprior.data.formats.heaps import open_checked
 
 
 def replaced(name, value):
@@ -25,10 +28,16 @@ def _no_demos(file, folder):
         del file["data"][name]
 
 
+def _two_rewards(file, folder):
+    for name, demo in file["data"].items():
+        replace(file, f"data/{name}/rewards", np.zeros((len(demo["actions"]), 2)))
+
+
 ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
 OTHERS = {
     "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "dataset", "group"]),
     "dataset for observations": (replaced("obs", np.zeros(3)), ["data/demo_1/obs", "dataset", "group"]),
+    "link to nothing": (replaced("", h5py.SoftLink("/nothing")), ["data/demo_1"]),
     "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
     "type": (
         env_args(json.dumps({"env_name": "Lift", "type": {}, "env_kwargs": {}})),
@@ -42,6 +51,7 @@ OTHERS = {
     "no key": (lambda f, folder: f.pop(OBJECT), ["data/demo_1", "'object'", "robot0_eef_pos"]),
     "short object": (replaced("obs/object", np.zeros((4, 14))), [OBJECT, "(4, 14)", "5 rows"]),
     "wide actions": (replaced("actions", np.zeros((5, 8))), [ACTIONS, "(5, 8)", "NutAssemblySquare", 7]),
+    "two rewards": (_two_rewards, ["data/demo_0/rewards", "(12, 2)"]),
     "text": (replaced("obs/object", np.array([b"a"] * 5)), [OBJECT, "numbers"]),
 }
 NAMED = {
@@ -70,7 +80,7 @@ def test_what_does_not_fit_is_refused_by_name(square_file, tmp_path, name):
     change, facts = OTHERS[name]
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
-    unreadable(path, *facts)
+    unreadable(path, *facts, steps={})
 
 
 @pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
@@ -136,6 +146,27 @@ def test_a_heap_of_strings_over_which_hdf5_walks_for_ever(square_file, monkeypat
     assert "heap" in found.detail
 
 
+@pytest.mark.parametrize("part", ["string", "heap"])
+def test_a_heap_that_is_damaged_or_longer_than_the_file(square_file, part):
+    path, _ = square_file
+    if part == "string":
+        damage_heap(path, part, 2**64 - 16)
+    else:
+        content = bytearray(path.read_bytes())
+        heap = content.rindex(b"GCOL")
+        content[heap + 8 : heap + 16] = (2**40).to_bytes(8, "little")
+        path.write_bytes(content)
+    unreadable(path, "heap")
+
+
+def test_a_file_that_is_cut_off_while_it_is_read(square_file):
+    path, _ = square_file
+    with open_checked(path) as file:
+        actions = file["data/demo_2/actions"]
+        os.truncate(path, actions.id.get_offset() + 8)
+        refuses(lambda: actions[()], OSError, "ends early")
+
+
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):
     path, _ = square_file
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
@@ -158,6 +189,37 @@ def test_values_that_no_robot_has(square_file, key, value):
     with h5py.File(path, "a") as file:
         file[f"data/demo_2/{key}"][17, ...] = value
     unreadable(path, f"data/demo_2/{key}", "row 17", steps={})
+
+
+OFFSETS = {"metres of a map": (5.4e6, 0.05), "ticks": (10**8, 3), "seconds": (2e8, 0.05)}
+
+
+@pytest.mark.parametrize("name", OFFSETS)
+@pytest.mark.parametrize("key", ["actions", "obs/object"])
+def test_large_numbers_whose_steps_float32_would_lose(square_file, key, name):
+    path, _ = square_file
+    offset, step = OFFSETS[name]
+
+    def write(values):
+        with h5py.File(path, "a") as file:
+            for demo in file["data"].values():
+                column = values(np.arange(len(demo["actions"])))
+                old = demo[key][()].astype(column.dtype)
+                old[:, 2] = column
+                replace(demo, key, old)
+
+    write(lambda t: offset + step * t)
+    facts = "column 2", f"{np.spacing(np.float32(offset)):g}", "offset"
+    unreadable(path, f"data/demo_0/{key}", *facts, steps={"actions": "stored"})
+    # Without the offset, in large steps, at rest, or as they were recorded in float32.
+    for values in (
+        lambda t: step * t,
+        lambda t: offset + 1000 * step * t,
+        lambda t: np.full(len(t), offset + 0.3),
+        lambda t: (offset + step * t).astype(np.float32),
+    ):
+        write(values)
+        RobomimicDemonstrations(path).steps(actions="stored")
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0.9, 0, 0, 0)])

@@ -299,6 +299,13 @@ class Frames(DemonstrationReader):
         return key
 
 
+def test_a_reader_gives_an_image_per_step():
+    demonstrations = Cameras("")
+    demonstrations.count = 130
+    with raises(DatasetError, "cameras", "demo 0", "0 images front", "30 steps"):
+        demonstrations.steps(images=["front"])
+
+
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
 @pytest.mark.parametrize("count", [6_000, pytest.param(60_000, marks=pytest.mark.slow)])
 def test_frames_of_a_training_stay_on_the_disk(count, monkeypatch):

@@ -9,6 +9,8 @@ import torch
 
 pytest.importorskip("lerobot")
 
+import av
+
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from tests.errors import raises, refuses
@@ -68,6 +70,20 @@ def entry(row, value, column=2):
     return change
 
 
+def sound(root):
+    with av.open(root / MOVIE, "w") as file:
+        stream = file.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        frame.sample_rate = 44100
+        file.mux([*stream.encode(frame), *stream.encode()])
+
+
+def unknown_codec(root):
+    content = (root / MOVIE).read_bytes()
+    assert b"av01" in content
+    (root / MOVIE).write_bytes(content.replace(b"av01", b"none"))
+
+
 def description(content):
     return lambda root: (root / "meta" / "warmprior.json").write_text(content)
 
@@ -123,6 +139,10 @@ META = {
     "a number of a camera": (info_of("video_path", "{video_key:03d}"), ["video_path="]),
     "other counts": (info_of("total_frames", 99), ["meta/info.json", 99, "meta/episodes"]),
     "another version": (described(format=2), ["warmprior.json", "version"]),
+    "narrow state": (
+        feature("observation.state", shape=[8], names=None),
+        ["Lift", "'observation.state': 8", 9],
+    ),
     "narrow actions": (feature("action", shape=[6], names=None), ["'action'", 6, "Lift", 7]),
     "no content": (lambda root: (root / "meta/info.json").write_text("[]"), ["content=[]"]),
     "negative file": (table(EPISODES, dataSLASHfile_index=entry(0, -1, None)), ["data/file_index"]),
@@ -133,6 +153,7 @@ META = {
     "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), PLACED),
     "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json", "masks"]),
     "no JSON": (cut("meta/info.json"), ["LeRobot"]),
+    "no steps": (table(EPISODES, length=lambda lengths: [7, 0, 9]), ["without steps"]),
     "no episodes": (without(EPISODES), ["meta/episodes/*/*.parquet", "finalize()"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps", 30, "Lift", 20]),
     "no action": (
@@ -155,6 +176,10 @@ META = {
 VALUES = {
     "cut off": (cut(DATA), ["damaged", "finalize()"]),
     "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
+    "dropped frames": (
+        table(DATA, timestamp=entry(slice(12, 16), [1.0] * 4, None)),
+        ["episode 2", "row 4", 20],
+    ),
     "other episodes": (table(DATA, episode_index=entry(6, 0, None)), ["meta/episodes", "finalize()"]),
 }
 ELSEWHERE = {
@@ -175,6 +200,8 @@ IMAGES = {
         "agentview_image",
     ),
     "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
+    "sound": (sound, [MOVIE, "observation.images.side", "codec", "audio"], "side_image"),
+    "unknown codec": (unknown_codec, [MOVIE, "observation.images.side", "codec"], "side_image"),
     "outside": (
         info_of("data_path", "../{chunk_index}/{file_index}.parquet"),
         ["'../0/0.parquet'", "folder"],
@@ -254,7 +281,9 @@ def test_observations_that_are_no_vectors_are_named(root, dtype, shape):
         LeRobotDemonstrations(root).steps(observations=["observation.state"])
 
 
-def test_bad_options(root):
+def test_bad_options(root, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
+    refuses(lambda: LeRobotDemonstrations("user/arm").index(), OSError, "user/arm", "v3.0", "connection")
     refuses(lambda: LeRobotDemonstrations(root).steps(storage="disk"), ValueError, "'disk'")
     refuses(lambda: LeRobotDemonstrations(root / "absent").steps(), FileNotFoundError, "meta/info.json")
     refuses(lambda: LeRobotDemonstrations(root, demos=4).steps(), DatasetError, 3, "demos=4")

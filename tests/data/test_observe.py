@@ -56,7 +56,7 @@ def test_observations_are_those_of_the_states(raw, lift_demonstrations, tmp_path
     assert task.name == "lift" and task.facts["demonstrations"] == 2
 
 
-def test_what_cannot_be_replayed_says_so(raw, tmp_path):
+def test_what_cannot_be_replayed_says_so(raw, tmp_path, monkeypatch):
     refuses(lambda: RobomimicDemonstrations(raw).steps(), DatasetError, "observe")
     taken = tmp_path / "taken.hdf5"
     taken.touch()
@@ -81,5 +81,8 @@ def test_what_cannot_be_replayed_says_so(raw, tmp_path):
     spoilt(lambda data: replace(data, "actions", np.zeros((steps, 8))), "demo_0", "8)", "7]")
     spoilt(lambda data: replace(data, "states", np.full((steps, 32), np.nan)), "demo_0/states", "row 0")
     spoilt(lambda data: data["demo_0"].pop("states"), "demo_0", "states")
+    with monkeypatch.context() as patched:
+        patched.setattr("warmprior.data.observe.scene_stays", lambda env: False)
+        spoilt(lambda data: None, "spoilt.hdf5", "Lift", "fixtures")
     spoilt(lambda data: data.attrs.pop("env_info"), "env_info")
     spoilt(lambda data: data.attrs.__setitem__("env_info", json.dumps({"env_name": "Nowhere"})), "Nowhere")

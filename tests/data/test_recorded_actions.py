@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.data.hdf5_faults import replace, unreadable
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
 from tests.errors import raises, refuses
 from warmprior.data import DatasetError, convert_robomimic
@@ -113,6 +114,15 @@ def test_poses_in_the_frame_of_the_base(tmp_path):
     for absolute in (False, True):
         with raises(DatasetError, "file.hdf5", "robot0_eef_pos", "input_ref_frame"):
             RobomimicDemonstrations(path).steps(actions="absolute" if absolute else "delta")
+
+
+def test_deltas_of_another_robot(tmp_path):
+    path, env_args = tmp_path / "file.hdf5", env_args_14("lift") | {"env_name": "Own"}
+    write(path, env_args=env_args)
+    with h5py.File(path, "a") as file:
+        for name in ("demo_0", "demo_1"):
+            replace(file, f"data/{name}/actions", np.pad(file[f"data/{name}/actions"], ((0, 0), (0, 1))))
+    unreadable(path, "8 columns", 7, steps={"actions": "absolute"})
 
 
 def test_a_converted_file_tells_the_same(tmp_path):

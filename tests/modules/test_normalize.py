@@ -51,6 +51,14 @@ def test_constant_dimension():
     assert torch.allclose(normalizer.normalize(moved)["observation"][:, 1], torch.tensor(0.25))
 
 
+def test_large_whole_numbers_keep_their_differences():
+    ticks = 10**8 + torch.arange(101).unsqueeze(-1)
+    data = TensorDict({"observation": ticks, "action": torch.rand(101, 1)}, [101])
+    units = Normalizer.fit(data).normalize(data)["observation"]
+    assert units.dtype == torch.float32
+    torch.testing.assert_close(units.diff(dim=0), torch.full((100, 1), 0.02), atol=2e-3, rtol=0)
+
+
 class Whole(CountingEnv):
     """The toy with an observation of whole numbers, or of flags."""
 

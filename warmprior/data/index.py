@@ -26,6 +26,9 @@ from warmprior.envs.robosuite_tasks import TaskSpec
 from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
+LARGE = 1e5
+"""The size from which on numbers may have an offset that takes the precision of their steps."""
+
 MISFIT = "They do not fit these actions: correct one or the other."
 
 
@@ -90,8 +93,11 @@ class DatasetIndex:
     joints: str = ""
 
     def __post_init__(self) -> None:
-        if not self.demos:
-            raise DatasetError(f"{self.path}: no demonstrations are chosen; the mask names none")
+        if not self.demos or not all(self.lengths):
+            what = (
+                "a demonstration without steps" if self.demos else "no demonstration, or the mask names none"
+            )
+            raise DatasetError(f"{self.path}: there is {what}: choose others")
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
@@ -220,9 +226,24 @@ def pose_keys(action_dim: int) -> list[str]:
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, first: int = 0) -> None:
     """Copy numbers to ``out``; raise DatasetError if one is not finite there, or above 1e9."""
-    with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
+    with reading(what, advice), np.errstate(over="ignore"):  # an overflow is infinite: reported below
         out[...] = block.reshape(out.shape)
     usable = np.abs(out) <= LARGEST  # False for NaN
     if not usable.all():
         value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
-        raise DatasetError(f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g}. {advice}")
+        raise DatasetError(
+            f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g} (of time stamps, those "
+            f"since the first). {advice}"
+        )
+
+
+def check_kept(exact: np.ndarray, kept: np.ndarray, what: str) -> None:
+    """Raise DatasetError if float32 changes a tenth of how numbers ``[N, d]`` differ from row to row."""
+    changes, steps = (np.square(np.diff(rows, axis=0)).sum(0) for rows in (kept - exact, exact))
+    if (lost := changes > 0.01 * steps).any():
+        column = int(lost.argmax())
+        largest = np.abs(kept[:, column]).max()
+        raise DatasetError(
+            f"{what} has numbers up to {largest:g} in column {column}, where those of float32 are "
+            f"{np.spacing(largest):g} apart, too coarse for their steps: subtract an offset, or leave it out"
+        )

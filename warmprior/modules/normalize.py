@@ -61,9 +61,9 @@ class RawUnits(nn.Module):
 class Normalizer(RawUnits):
     """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
-    A dimension counts as constant, and is only shifted, if half its range is at most ``1e-5 * max(1,
-    |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers; they keep their precision
-    where a policy is cast to a lower one.
+    A dimension counts as constant, and is only shifted, if half its range is at most 1 and at most ``1e-5 *
+    max(1, |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers; they keep their
+    precision where a policy is cast to a lower one.
 
     Args:
         low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.
@@ -98,7 +98,7 @@ class Normalizer(RawUnits):
             # Halved first, because the sum of large numbers may be infinite.
             first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first
-            constant = half <= LEAST * loc.abs().clamp_min(1.0)
+            constant = half <= LEAST * loc.abs().clamp(1.0, 1 / LEAST)
             if key == keys.ACTION:
                 warn_of_tiny(half, loc)
             self.register_buffer(_name(key, "loc"), loc)
@@ -168,8 +168,9 @@ class Normalizer(RawUnits):
             value, loc = data.get(key, None), self.loc(key)
             if value is not None:
                 check_width(key, value.shape, loc)
-                value = value if value.is_floating_point() else value.to(loc.dtype)
-                data.set(key, (value - loc) / self.scale(key))
+                exact = value if value.is_floating_point() else value.double()  # of large integers too
+                units = (exact - loc) / self.scale(key)
+                data.set(key, units.to(torch.promote_types(value.dtype, loc.dtype)))
         return data
 
     def denormalize(self, data: TensorDictBase) -> TensorDictBase:

@@ -236,7 +236,7 @@ def selected_demos(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
     for name in selected:
         if not (name.startswith("demo_") and name[5:].isdecimal()):
             raise DatasetError(f"{file.filename}: data/{name} is not called demo_<number>; rename the group")
-    return tuple(sorted(selected, key=lambda name: int(name[5:])))  # by number: names have no leading zeros
+    return tuple(sorted(sorted(selected), key=lambda name: int(name[5:])))
 
 
 def read_described(file: h5py.File, name: str) -> Any:
@@ -246,15 +246,16 @@ def read_described(file: h5py.File, name: str) -> Any:
         return json.loads(attributes[name]) if name in attributes else None
 
 
-def _check_total(file: h5py.File, steps: int) -> None:
-    """Compare the steps of all demos with the file's own count, if it has one: damage can hide a demo."""
-    with reading(file, "data.attrs['total']"):
-        total = file["data"].attrs.get("total")
-        differs = total is not None and int(total) != steps
+def _check_count(group: h5py.Group, name: str, steps: int) -> None:
+    """Compare steps with a group's own count, if there is one: damage can hide demos, and rows be padding."""
+    what = f"{_place(group)}.attrs[{name!r}]"
+    with indices.reading(what, _AGAIN):
+        count = group.attrs.get(name)
+        differs = count is not None and int(count) != steps
     if differs:
         raise DatasetError(
-            f"{file.filename}: data.attrs['total'] counts {total} steps, but the demos have {steps}: one is "
-            "missing or incomplete. Copy or download it again, or correct the attribute."
+            f"{what} counts {count} steps, but there are {steps}: a demo is missing, incomplete or padded. "
+            "Copy or download it again, or correct the attribute."
         )
 
 
@@ -440,6 +441,7 @@ class RobomimicDemonstrations(Demonstrations):
                 if demo is None:  # the name is listed, but a damaged index hides the demo
                     raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
                 steps, widths = _widths(demo, obs_names)
+                _check_count(demo, "num_samples", steps)
                 if lengths and widths.keys() != expected.keys():
                     raise DatasetError(
                         f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'"
@@ -465,7 +467,7 @@ class RobomimicDemonstrations(Demonstrations):
             # What some demos lack cannot be chosen.
             taken_by = dict.fromkeys(present - common, "") | _options(group, common - {*keys, *images})
             if self.mask is None and self.demos is None:
-                _check_total(file, sum(lengths))
+                _check_count(file["data"], "total", sum(lengths))
         return DatasetIndex(
             path=path,
             demos=selected,

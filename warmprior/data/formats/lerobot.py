@@ -72,7 +72,7 @@ class LeRobotReader(DemonstrationReader):
         if file != self._file:  # columns of one file are kept at a time
             self._file, self._read = file, {}
         start, number = episode["dataset_from_index"], episode["episode_index"]
-        with reading(f"{self.index.path / file}", _AGAIN):
+        with reading(f"{self.index.path / file}: {feature}", _AGAIN):
             check_regular(self.index.path / file)
             index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
             first = int(np.searchsorted(index, start))
@@ -80,6 +80,13 @@ class LeRobotReader(DemonstrationReader):
             expected = np.arange(start, start + episode["length"])
             if not np.array_equal(index[rows], expected) or (numbers[rows] != number).any():
                 raise ValueError(f"episode {number} is not where meta/episodes says")
+            steps = np.diff(self._column("timestamp")[rows, 0]) * (fps := self.index.metadata.fps)
+            if (wrong := abs(steps - 1) > 0.5).any():
+                row = int(wrong.argmax())
+                raise DatasetError(
+                    f"{self.index.path / file}: timestamp of episode {number} leaps {steps[row] / fps:g} s "
+                    f"after row {row}, but fps is {fps}: correct that in meta/info.json. {_REBUILD}"
+                )
             return self._column(feature)[rows]
 
     def _column(self, name: str) -> np.ndarray:
@@ -115,7 +122,7 @@ class LeRobotReader(DemonstrationReader):
         path = self.index.path / episode_file(self.index.metadata, episode, video)
         shape = (3, *self.index.image_shapes[self.index.image_keys.index(key)])
         length, step = episode["length"], max(1, DECODED // prod(shape))
-        with reading(f"{path}", _AGAIN):
+        with reading(f"{path}: {feature} of episode {demo}", _AGAIN):
             check_regular(path)
             frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
             for first in range(0, length, step):
@@ -132,7 +139,11 @@ class LeRobotReader(DemonstrationReader):
         return "lerobot", {"pyav": "av"}.get(backend, backend)
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
-        video = require("lerobot.datasets.video_utils", "lerobot")
+        av, video = (require(name, "lerobot") for name in ("av", "lerobot.datasets.video_utils"))
+        with av.open(path) as opened:  # to decode a codec that is unknown here would end the process
+            if not any(stream.codec_context for stream in opened.streams.video):
+                kinds = ", ".join(stream.type for stream in opened.streams) or "nothing"
+                raise ValueError(f"no video with a known codec among its streams: {kinds}")
         times = self._rows(episode, "timestamp")[:, 0].astype(np.float64)
         times += episode[f"videos/{feature}/from_timestamp"]
 

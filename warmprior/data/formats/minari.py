@@ -223,15 +223,14 @@ class MinariDemonstrations(Demonstrations):
         for kind, wanted, present in (("observation", chosen, vectors), ("image", images, pictures)):
             for key in wanted:
                 if key not in present:
-                    raise unknown_name_error(where, kind, key, present)
+                    known = f"{key} ({spaces[key]})" if key in spaces else key
+                    raise unknown_name_error(where, kind, known, present)
         check_count(where, self.demos, dataset.total_episodes)
         episodes = [int(i) for i in dataset.episode_indices][: self.demos]
         whole = self.demos in (None, dataset.total_episodes)
         with reading(f"{where}: its episodes", _AGAIN):
             steps = [int(facts["total_steps"]) for facts in dataset.storage.get_episode_metadata(episodes)]
             counted = dataset.total_steps if whole else sum(steps)
-        if not steps or min(steps) < 1:
-            raise DatasetError(f"{where}: there is no demonstration, or an empty one: delete it")
         if counted != sum(steps):
             differs = f"metadata.json counts {counted} steps, but the episodes {sum(steps)}"
             raise DatasetError(f"{where}: {differs}. {_AGAIN}")
