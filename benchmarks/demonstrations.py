@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from lab.demonstrations.downloads import OFFICIAL
-from lab.demonstrations.scripted.tasks import EXPERTS
+from lab.demonstrations.scripted.experts import EXPERTS
 from lab.options.command_line import script
 from warmprior.io.script import read_command_line
 

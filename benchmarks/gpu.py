@@ -233,7 +233,7 @@ def commit_of_sources() -> str:
 @script("gpu.py", hint="the same command continues")
 def main(argv: list[str] | None) -> None:
     o = read(GpuOptions(), sys.argv[1:] if argv is None else argv, __doc__)
-    from lab.reporting.rows import RESULTS, read_lines
+    from lab.reporting.rows import read_lines
 
     o.check()
     parts = sorted(set(o.part or PARTS))
@@ -243,7 +243,7 @@ def main(argv: list[str] | None) -> None:
     os.environ.setdefault("WARMPRIOR_CACHE", str((o.out / "inputs").absolute()))
     recorded = {name: value for name, value in asdict(o).items() if name not in ("part", "out", "commit")}
     identity = {"commit": o.commit or commit_of_sources(), "options": json.loads(json.dumps(recorded))}
-    path, failures = o.out / RESULTS, []
+    path, failures = o.out / "parts.jsonl", []
     rows = read_lines(path) if path.exists() else []
     for number in parts:
         work, minutes = PARTS[number]

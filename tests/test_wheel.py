@@ -90,7 +90,7 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
     assert {"constraints.txt", "docs/conf.py", "tests/conftest.py"} <= names
     assert {
         "benchmarks/lab/options/options.py",
-        "benchmarks/lab/demonstrations/scripted/tasks.py",
+        "benchmarks/lab/demonstrations/scripted/experts.py",
         "tests/lab/__init__.py",
     } <= names
     for folder in ("benchmarks", "docs", "tests", "plugins"):

@@ -17,7 +17,7 @@ import tyro
 from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
-from warmprior.options.agent import Algorithm
+from warmprior.options.agent import IMPROVE, Algorithm
 from warmprior.options.data import PLACES
 from warmprior.options.evaluation import EVALUATION_SEED
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
@@ -212,7 +212,7 @@ def improve(
     folder: Policy,
     /,
     *,
-    steps: int = 100_000,
+    steps: int = IMPROVE.environment_steps,
     algorithm: Algorithm = "dsrl-na",
     delta: float | None = None,
     residual_length: int | None = None,
@@ -244,13 +244,13 @@ def improve(
         modules: module that defines your own prior, start point or network; may be repeated
     """
     from warmprior.rl.agent import delta_of
-    from warmprior.rl.improve import SMALL, improve_policy
+    from warmprior.rl.improve import improve_policy
     from warmprior.saving.policies import save_policy
 
     actor = _policy(folder, revision, modules)
-    warmup = min(SMALL.warmup_steps, steps)
+    warmup = min(IMPROVE.warmup_steps, steps)
     config = replace(
-        SMALL,
+        IMPROVE,
         algorithm=algorithm,
         environment_steps=steps,
         warmup_steps=warmup,

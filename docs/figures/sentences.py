@@ -1,6 +1,7 @@
 """The sentences of pages whose numbers come from rows, as the rows say them.
 
-The tests look for each in its page. A sentence that is not there has older numbers, or other words.
+`tests/test_docs.py` looks for each in its page. A sentence that is not there has older numbers, or other
+words.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def test_parts_write_rows_once_and_a_failure_stops_no_other(demonstrations, tmp_
         patch.setitem(gpu.PARTS, 2, (broken, 3.0))
         said = refused(gpu.main, smallest(tmp_path, 2, 3, 4), capsys)
     assert said.endswith("part 2, broken: it broke after 180 s")
-    speed, states = stored(tmp_path)
+    speed, states = stored(tmp_path, "parts")
     assert (speed["part"], states["part"]) == (3, 4) and min(speed["results"].values()) > 0
     (trained,), played = states["results"]["trained"], states["results"]["played"]
     assert trained["iterations"] == gpu.TINY_PROBE and trained["prior"] == "past"
@@ -43,10 +43,10 @@ def test_parts_write_rows_once_and_a_failure_stops_no_other(demonstrations, tmp_
 
     assert run(tmp_path, 2, 3, 4) == 0
     assert "part 4, states: done before" in capsys.readouterr().out
-    assert [row["part"] for row in stored(tmp_path)] == [3, 4, 2]
-    assert stored(tmp_path)[-1]["results"] == {"cuda_train_step_over_network": None}
+    assert [row["part"] for row in stored(tmp_path, "parts")] == [3, 4, 2]
+    assert stored(tmp_path, "parts")[-1]["results"] == {"cuda_train_step_over_network": None}
     assert run(tmp_path, 3, preset="quick") == 0  # other options are another row
-    assert [row["options"]["preset"] for row in stored(tmp_path)] == ["paper"] * 3 + ["quick"]
+    assert [row["options"]["preset"] for row in stored(tmp_path, "parts")] == ["paper"] * 3 + ["quick"]
 
 
 def test_methods_share_the_time(demonstrations, tmp_path, monkeypatch):
@@ -68,7 +68,7 @@ def test_methods_share_the_time(demonstrations, tmp_path, monkeypatch):
 def test_every_part_can_be_tried_without_a_gpu(demonstrations, tmp_path):
     words = ["--device", "cpu", "--smallest", "--commit", "abc", "--out", str(tmp_path)]
     subprocess.run([sys.executable, gpu.__file__, *words], check=True)
-    found = {row["part"]: row["results"] for row in stored(tmp_path)}
+    found = {row["part"]: row["results"] for row in stored(tmp_path, "parts")}
     assert list(found) == list(gpu.PARTS)
     assert found[1]["passed"] + found[1]["skipped"] >= 12 and not found[1]["failed"]
     assert found[0]["image"]["demonstrations"] == 3 and found[5]["trained"][0]["iterations"] == gpu.TINY_PROBE

@@ -270,7 +270,7 @@ class Cameras(Demonstrations):
             lengths=(self.count - 100, 100),
             observation_keys=("joints",),
             observation_dims=(6,),
-            **self.pictured(images, {"front": self.shape}),
+            **self.image_entries(images, {"front": self.shape}),
             available_keys=("joints", "front"),
             action_dim=6,
         )

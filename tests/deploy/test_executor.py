@@ -463,7 +463,7 @@ def test_statistics_that_are_loaded_between_two_episodes(assign):
 
 def test_a_delay_behind_what_is_guided():
     """Guidance refuses such delays: the robot goes on all the same."""
-    guided = actor(PreviewPrior(6), guidance=RealTimeChunking(horizon=2))
+    guided = actor(PreviewPrior(6), guidance=RealTimeChunking(execution_horizon=2))
     clock = FakeClock([4, *[1] * 20])
     executor = AsyncExecutor(guided, execute=4)
     executor._thread = clock

@@ -10,9 +10,9 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 
+from lab.demonstrations.scripted.experts import EXPERTS
 from lab.demonstrations.scripted.motion import ArmRunner
 from lab.demonstrations.scripted.operators import SKILLED, Demonstrator
-from lab.demonstrations.scripted.tasks import EXPERTS
 from tests.data.synthetic import env_args_14
 from tests.errors import raises
 from tests.processes import apart

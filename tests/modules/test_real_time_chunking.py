@@ -96,12 +96,14 @@ def test_without_the_jacobian_it_is_lerobots(time):
     )
     with torch.no_grad():
         theirs = rtc.RTCProcessor(config).denoise_step(a, y, 3, time, lambda x: -velocity(at(1 - time, x), x))
-    ours = RealTimeChunking(schedule="linear", max_guidance_weight=10.0, horizon=7, jacobian=False, sigma=1.0)
+    ours = RealTimeChunking(
+        schedule="linear", max_guidance_weight=10.0, execution_horizon=7, jacobian=False, sigma=1.0
+    )
     everything, delay = torch.full((B, 1), P), torch.full((B, 1), 3)
     guided = ours.guided(velocity, y, everything, delay, sigma=torch.tensor(0.3))
     # Theirs computes the weight in single precision.
     torch.testing.assert_close(guided(at(1 - time, a), a), -theirs, rtol=1e-5, atol=1e-5)
-    exact = RealTimeChunking(schedule="linear", max_guidance_weight=10.0, horizon=7)
+    exact = RealTimeChunking(schedule="linear", max_guidance_weight=10.0, execution_horizon=7)
     difference = exact.guided(velocity, y, everything, delay)(at(1 - time, a), a) + theirs
     assert difference.abs().max() > 0.05  # another method
 
@@ -177,15 +179,15 @@ def test_gradients_are_its_own_affair():
 
 
 def test_options_and_delays_that_cannot_be():
-    wrong = {"schedule": "cosine", "horizon": 0, "max_guidance_weight": 0.0, "sigma": -0.1}
+    wrong = {"schedule": "cosine", "execution_horizon": 0, "max_guidance_weight": 0.0, "sigma": -0.1}
     for name, value in wrong.items():
         with raises(ValueError, name, value):
             RealTimeChunking(**{name: value})
     _, y, left, delay = batch()
     late = delay + torch.tensor([[5], [0], [0]])
     refuses(lambda: RealTimeChunking().guided(network(), y, left, late), ValueError, "delay", 8, 7)
-    with raises(ValueError, "horizon=2", "delay", 3):
-        RealTimeChunking(horizon=2).guided(network(), y, left, delay)
+    with raises(ValueError, "execution_horizon=2", "delay", 3):
+        RealTimeChunking(execution_horizon=2).guided(network(), y, left, delay)
     for wrong in ((left[:2], delay), (left, delay.squeeze(1))):
         with raises(ValueError, "forecast_steps", "delay", "[B, 1]"):
             RealTimeChunking().guided(network(), y, *wrong)

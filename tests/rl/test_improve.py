@@ -171,7 +171,7 @@ def test_a_policy_without_an_environment_is_refused(tmp_path):
     with raises(ValueError, 5000, "episodes"):
         improve_policy(make_actor(), tmp_path, make_env=make_env, make_transforms=list, episodes=5001)
     with raises(ValueError, "guidance=None"):
-        improve_policy(make_actor().replace(guidance=RealTimeChunking(horizon=2)), tmp_path)
+        improve_policy(make_actor().replace(guidance=RealTimeChunking(execution_horizon=2)), tmp_path)
     registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": None}
     described = registered_description({**registered, "observation_keys": ["observation"]})
     with raises(ValueError, "Pendulum-v1", "make_env"):

@@ -178,7 +178,7 @@ class Seeing(VelocityMLP):
 @pytest.mark.parametrize(
     ("change", "agent", "words"),
     [
-        ({"guidance": RealTimeChunking(horizon=2)}, {}, ["guidance=None"]),
+        ({"guidance": RealTimeChunking(execution_horizon=2)}, {}, ["guidance=None"]),
         ({}, {"in_keys": [keys.OBSERVATION, "goal"]}, ["goal", "anchor"]),
         ({"network": Seeing(ACTION_DIM, WIDTH, H, observation_steps=1)}, {}, ["images"]),
     ],

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
 from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.in_memory import demonstrations_of
 from warmprior.data.index import DatasetError
-from warmprior.data.memory import demonstrations_of
 from warmprior.data.observe import observe_recordings
 from warmprior.data.opening import open_demonstrations
 

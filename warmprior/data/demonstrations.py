@@ -12,7 +12,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from warmprior.checks import check_between, check_choice, check_whole_numbers, given
-from warmprior.data.frames import cached_images
+from warmprior.data.image_cache import cached_images
 from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
@@ -147,7 +147,7 @@ class Demonstrations:
         """Return the index, from names and shapes alone; with ``poses`` every arm's pose must be there."""
         raise NotImplementedError
 
-    def pictured(self, images: Sequence[str], shapes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    def image_entries(self, images: Sequence[str], shapes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
         """Return the entries of an index for images, given their heights and widths as they are stored."""
         found = tuple(shapes[key] for key in images)
         sides = {side for shape in found for side in shape}
@@ -243,7 +243,7 @@ class Demonstrations:
                 arm (see :func:`warmprior.envs.absolute_actions`); or ``"stored"``, the numbers of the file
                 also where these are poses that it declares as deltas (``low_dim_abs.hdf5``).
             storage: where images are: in ``"memory"``, or as a ``"memmap"`` of the cache, in which the next
-                reader finds them (see :func:`~warmprior.data.frames.cached_images`).
+                reader finds them (see :func:`~warmprior.data.image_cache.cached_images`).
 
         Raises:
             FileNotFoundError: if there is no such place.

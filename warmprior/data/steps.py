@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_choice
-from warmprior.data.frames import image_shape, read_images
+from warmprior.data.image_cache import image_shape, read_images
 from warmprior.data.index import (
     BLOCK,
     LARGE,

@@ -147,7 +147,7 @@ class AsyncExecutor:
         self._device = getattr(plain, "device", None) or device_of(actor)
         # Guidance raises an error for delays longer than its horizon.
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
-        self._reach = getattr(guidance, "horizon", None) or length
+        self._reach = getattr(guidance, "execution_horizon", None) or length
         self._statistics = normalizer
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._postprocess = getattr(plain, "postprocess", None)

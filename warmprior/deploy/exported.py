@@ -31,7 +31,7 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
-from warmprior.modules.source import noise_factor
+from warmprior.modules.sampling import effective_temperature
 
 FIELDS = {
     *("program", "torch", "processor", "prior", "nfe", "temperature", "inputs"),
@@ -125,7 +125,7 @@ def export_policy(policy: WarmPriorActor, path: str | Path, *, nfe: int | None =
             raise ValueError(f"a policy with {what} cannot be exported: run the policy itself")
     fixed = policy.replace(
         nfe=policy.sampling.evaluations(nfe),
-        temperature=noise_factor(policy.sampling.temperature),
+        temperature=effective_temperature(policy.sampling.temperature),
         generator=None,
     ).to("cpu")
     prior = fixed.prior

@@ -22,8 +22,7 @@ from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.generator import Drawing
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
-from warmprior.modules.sampling import Sampling
-from warmprior.modules.source import noise_factor
+from warmprior.modules.sampling import Sampling, effective_temperature
 
 _TURNS: WeakKeyDictionary[Any, Lock] = WeakKeyDictionary()
 """A lock per policy: decisions take turns, because each replaces the policy's sampler for its duration."""
@@ -236,7 +235,7 @@ class LeRobotActor(Drawing, TensorDictModuleBase):
         """Draw the source and the chunk."""
         chunks, generator = self.ode.source, self.chosen_generator(generator)
         source = chunks.distribution(tensordict.get(keys.HISTORY, None))
-        temperature = noise_factor(self.sampling.temperature)
+        temperature = effective_temperature(self.sampling.temperature)
         values = source.loc, source.sample(generator, temperature)
         loc, a0 = (chunks.scaled(value, source.warm) for value in values)
         tensordict.update({keys.LOC: loc, keys.WARM: source.warm, keys.NOISE: a0})

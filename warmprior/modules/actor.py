@@ -22,7 +22,8 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import Registered, kept_arguments
-from warmprior.modules.source import Source, noise_factor
+from warmprior.modules.sampling import effective_temperature
+from warmprior.modules.source import Source
 
 
 class StartPoint(Registered, nn.Module):
@@ -123,7 +124,7 @@ class PriorSampler(Drawing, TensorDictModuleBase):
     ) -> TensorDictBase:
         """Write the mean, the mask of warm positions, and a sample at a temperature."""
         source = self.source(tensordict)
-        point = source.sample(self.chosen_generator(generator), noise_factor(temperature))
+        point = source.sample(self.chosen_generator(generator), effective_temperature(temperature))
         if self.start is not None:
             point = self.start(point, *self._inputs(tensordict))
         for key, value in zip(self.out_keys_source, (source.loc, source.warm, point), strict=True):

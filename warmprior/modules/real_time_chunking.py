@@ -45,7 +45,7 @@ class RealTimeChunking(GuidanceOptions):
     (docs/real_time_chunking.md derives it). :math:`\sigma = 1` is the published weight,
     :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
     (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the first ``d`` positions, at which the old
-    chunk is executed, then falls as ``schedule`` says, and is 0 from ``horizon`` on.
+    chunk is executed, then falls as ``schedule`` says, and is 0 from ``execution_horizon`` on.
 
     Its arguments are those of :class:`~warmprior.options.guidance.GuidanceOptions`.
 
@@ -63,16 +63,17 @@ class RealTimeChunking(GuidanceOptions):
     """
 
     def check_reach(self, delay: int, forecast_steps: int) -> None:
-        """Raise ValueError if the delay exceeds the horizon, or the steps that the old chunk covers."""
+        """Raise ValueError if the delay exceeds the execution horizon, or the steps of the old chunk."""
         if not 0 <= delay <= forecast_steps:
             raise ValueError(
                 f"a delay of {delay} control steps needs as many actions of the old chunk, but only "
                 f"{forecast_steps} are left: execute fewer actions per decision, or predict longer chunks"
             )
-        if self.horizon is not None and self.horizon < delay:
+        if self.execution_horizon is not None and self.execution_horizon < delay:
             raise ValueError(
-                f"the guidance ends at horizon={self.horizon}, before the delay of {delay} control steps "
-                f"ends: set horizon >= delay, or None for all {forecast_steps} actions that are left"
+                f"the guidance ends at execution_horizon={self.execution_horizon}, before the delay of "
+                f"{delay} control steps ends: set execution_horizon >= delay, or None for all "
+                f"{forecast_steps} actions that are left"
             )
 
     def weights(
@@ -80,7 +81,8 @@ class RealTimeChunking(GuidanceOptions):
     ) -> Tensor:
         """Return the weights :math:`W` ``[*B, P]`` for a delay and steps of the forecast, int64 ``[*B]``."""
         i = torch.arange(length, device=delay.device)
-        end = forecast_steps if self.horizon is None else forecast_steps.clamp(max=self.horizon)
+        last = self.execution_horizon
+        end = forecast_steps if last is None else forecast_steps.clamp(max=last)
         end = end.unsqueeze(-1)
         start = torch.minimum(delay.unsqueeze(-1), end)
         linear = ((start - 1 - i).to(dtype or torch.get_default_dtype()) / (end - start + 1) + 1).clamp(0, 1)

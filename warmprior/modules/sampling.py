@@ -9,6 +9,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers, given
 from warmprior.options.evaluation import DEFAULT_NFE
@@ -80,6 +81,13 @@ def steps_of(nfe: int, solver: str) -> int:
             f"positive multiple of {stages} for the {solver} solver, got {nfe!r}"
         )
     return nfe // stages
+
+
+def effective_temperature(temperature: float | None) -> float:
+    """Return a decision's temperature: by default 1, or 0 while TorchRL explores deterministically."""
+    if temperature is not None:
+        return temperature
+    return 1.0 if exploration_type() in (None, ExplorationType.RANDOM) else 0.0
 
 
 @dataclass(frozen=True)

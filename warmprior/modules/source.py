@@ -1,4 +1,4 @@
-"""Source distributions: where the flow of an action chunk starts, and how much noise a decision draws."""
+"""Source distributions: where the flow of an action chunk starts."""
 
 from __future__ import annotations
 
@@ -7,16 +7,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from warmprior.checks import given
-
-
-def noise_factor(temperature: float | None) -> float:
-    """Return a decision's temperature: by default 1, or 0 while TorchRL explores deterministically."""
-    if temperature is not None:
-        return temperature
-    return 1.0 if exploration_type() in (None, ExplorationType.RANDOM) else 0.0
 
 
 @dataclass(frozen=True)

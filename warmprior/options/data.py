@@ -17,7 +17,10 @@ PLACES = (
 """The places of demonstrations, as help says them: one per format of ``warmprior.data.opening.FORMATS``."""
 
 IMAGE_SIZE = 84
-"""The default side of images in pixels, as in the paper (Table 3)."""
+"""The default side of images in pixels, as in the paper (Table 3).
+
+:meth:`~warmprior.data.Demonstrations.image_entries` takes it for images of several shapes, or not square.
+"""
 
 IMAGE_SIZES = (8, 1024)
 """The least and largest side of images that policies see: a decision on larger ones takes gigabytes."""

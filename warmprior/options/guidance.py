@@ -15,8 +15,8 @@ class GuidanceOptions:
     """The options of :class:`~warmprior.RealTimeChunking`.
 
     Attributes:
-        horizon: first position without guidance (LeRobot's execution_horizon, the official code's
-            prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
+        execution_horizon: first position without guidance (LeRobot's name; prefix_attention_horizon in the
+            official code); by default the end of the old chunk, as in the official studies.
         schedule: "exp" (the official default) or "linear" (LeRobot's).
         max_guidance_weight: largest weight; 5 in the official code, 10 in LeRobot.
         jacobian: False takes the identity for the Jacobian, as LeRobot 0.6 does. That needs no gradients and
@@ -30,7 +30,7 @@ class GuidanceOptions:
         5.0
     """
 
-    horizon: int | None = None
+    execution_horizon: int | None = None
     schedule: Schedule = "exp"
     max_guidance_weight: float = 5.0
     jacobian: bool = True
@@ -38,6 +38,6 @@ class GuidanceOptions:
 
     def __post_init__(self) -> None:
         check_choice("schedule", self.schedule, get_args(Schedule))
-        check_whole_numbers(**given(horizon=self.horizon))
+        check_whole_numbers(**given(execution_horizon=self.execution_horizon))
         check_positive(max_guidance_weight=self.max_guidance_weight)
         check_not_negative(**given(sigma=self.sigma))

@@ -1,4 +1,7 @@
-"""Options of ``python -m warmprior train``, in addition to those of sources, networks and trainings."""
+"""Options of ``python -m warmprior train``, in addition to those of sources, networks and trainings.
+
+``train`` in ``warmprior/__main__.py`` passes each of them on.
+"""
 
 from __future__ import annotations
 

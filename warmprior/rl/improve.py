@@ -16,24 +16,10 @@ from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.options.agent import PriorSpaceConfig
+from warmprior.options.agent import IMPROVE, PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
-
-SMALL = PriorSpaceConfig(
-    environment_steps=100_000,
-    warmup_steps=4_000,
-    updates=4,
-    noise_critic_steps=2,
-    hidden_dim=256,
-    gamma=0.98,
-    # At 1, the entropy of a chunk would be worth more than a success until the temperature has fallen.
-    alpha_init=0.05,
-    evaluate_every=10_000,
-    evaluation_episodes=50,
-)
-"""A recipe for two cores and simulated manipulation, whose episodes have some fifty decisions."""
 
 APART = 5_000
 """The distance between the seeds of episodes that are reported, that choose an agent, and that confirm it."""
@@ -99,7 +85,7 @@ def improve_policy(
             the environment that the policy was made for, rewarded by its success.
         make_transforms: builds the policy's transforms for ``make_env``.
         num_envs: environments in worker processes.
-        config: the recipe; by default :data:`~warmprior.rl.improve.SMALL`, at the policy's own number of
+        config: the recipe; by default :data:`~warmprior.options.agent.IMPROVE`, at the policy's own number of
             network evaluations.
         episodes: episodes of the final comparison.
         compile: True compiles the agent's updates with :func:`torch.compile`, which needs a C++ compiler.
@@ -143,7 +129,7 @@ def improve_policy(
     elif make_transforms is None:
         raise ValueError("make_env needs make_transforms, such as partial(policy_transforms, policy)")
     builders = make_env, make_transforms
-    config = replace(SMALL, nfe=policy.sampling.evaluations()) if config is None else config
+    config = replace(IMPROVE, nfe=policy.sampling.evaluations()) if config is None else config
 
     if max(episodes, config.evaluation_episodes) > APART:
         raise ValueError(f"more than {APART} episodes would choose and report by the same ones")

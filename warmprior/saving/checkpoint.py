@@ -1,4 +1,4 @@
-"""States of training runs and agents on disk, and their identity: a safetensors file each, never a pickle."""
+"""Files of policies, training runs and agents, checked against their digest, and the identity of a run."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior.checks import given
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.images import check_images, renderer_versions
+from warmprior.data.image_check import check_images, renderer_versions
 from warmprior.data.index import DatasetIndex
 from warmprior.envs.description import environment_description, registered_description, robosuite_parts
 from warmprior.envs.env_args import modernize_env_args

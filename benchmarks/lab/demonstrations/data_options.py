@@ -138,7 +138,7 @@ class DataOptions(Resizing):
             FileNotFoundError: if the file does not exist.
             ImportError: if MimicGen's data are to be downloaded, but its package is not installed.
         """
-        from lab.demonstrations.scripted.tasks import EXPERTS
+        from lab.demonstrations.scripted.experts import EXPERTS
         from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
         from warmprior.envs.rendering import require_rendering
         from warmprior.envs.robosuite_tasks import get_task

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from lab.io.workers import available_cores, working
 from warmprior.checks import check_distinct, check_whole_numbers, given
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
-from warmprior.data.images import StateRenderer, renderer_versions
+from warmprior.data.image_check import StateRenderer, renderer_versions
 from warmprior.data.index import DatasetError, DatasetIndex
 from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require

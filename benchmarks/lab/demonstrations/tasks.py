@@ -19,7 +19,7 @@ from lab.demonstrations.scripted.generate import generate_demonstrations
 from warmprior.checks import check_choice
 from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
-from warmprior.data.images import check_images, renderer_versions
+from warmprior.data.image_check import check_images, renderer_versions
 from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
 from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.io.files import digest_of

@@ -14,23 +14,23 @@ from warmprior import PriorAnchor, WarmPriorActor, keys, policy_transforms
 from warmprior.envs import RobosuiteEnv
 from warmprior.evaluation import parallel_env
 from warmprior.io.workers import torch_threads
+from warmprior.options.agent import IMPROVE
 from warmprior.rl.agent import PriorSpaceAgent
-from warmprior.rl.improve import SMALL
 
 ENVIRONMENTS, DECISIONS = 4, 5
 
 
 def learning_over_environments(clock: Clock) -> float:
-    """Four simulators of square in worker processes, and the compiled updates of ``SMALL``."""
+    """Four simulators of square in worker processes, and the compiled updates of ``IMPROVE``."""
     torch.manual_seed(0)
     threads = torch.get_num_threads()  # as PriorSpaceTraining, whose updates take those of waiting workers
     policy = WarmPriorActor(default_network(), PRIOR, nfe=1).eval()
     workers = parallel_env(partial(RobosuiteEnv, "square"), partial(policy_transforms, policy), ENVIRONMENTS)
     env = TransformedEnv(workers, PriorAnchor(policy))
     env.set_seed(0, static_seed=True)
-    agent = PriorSpaceAgent(policy, SMALL)
+    agent = PriorSpaceAgent(policy, IMPROVE)
     agent.compile()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=SMALL.batch_size)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=IMPROVE.batch_size)
     after = env.reset()
     chunk = agent.policy(after.copy())[keys.CHUNK]  # what simulators alone execute, again and again
 

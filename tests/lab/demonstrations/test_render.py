@@ -20,7 +20,7 @@ from tests.processes import apart, here
 from warmprior.__main__ import main
 from warmprior.data import DatasetError
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
-from warmprior.data.images import check_images
+from warmprior.data.image_check import check_images
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

@@ -474,7 +474,7 @@ class RobomimicDemonstrations(Demonstrations):
             lengths=tuple(lengths),
             observation_keys=keys,
             observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
-            **self.pictured(images, shapes),
+            **self.image_entries(images, shapes),
             available_keys=tuple(sorted(present)),
             taken_by=taken_by,
             action_dim=widths["actions"],

@@ -341,7 +341,7 @@ def read_lerobot_index(
         lengths=tuple(row["length"] for row in rows),
         observation_keys=tuple(observations),
         observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observations),
-        **demonstrations.pictured(
+        **demonstrations.image_entries(
             images, {key: _image_shape(root, metadata.features, cameras, key) for key in images}
         ),
         available_keys=tuple(available),

@@ -240,7 +240,7 @@ class MinariDemonstrations(Demonstrations):
             lengths=tuple(steps),
             observation_keys=chosen,
             observation_dims=tuple(vectors[key] for key in chosen),
-            **self.pictured(images, pictures),
+            **self.image_entries(images, pictures),
             available_keys=tuple(spaces),
             taken_by={key: "images" if key in pictures else "" for key in spaces if key not in vectors},
             action_dim=action.shape[0],

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from lab.demonstrations.scripted.experts import EXPERTS
 from lab.demonstrations.scripted.motion import ArmRunner
 from lab.demonstrations.scripted.operators import LEVELS, OPERATORS, SKILLED, Demonstrator
-from lab.demonstrations.scripted.tasks import EXPERTS
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import make_simulator, task_env_args

@@ -19,8 +19,8 @@ from lab.demonstrations.scripted.episode import (
     run_episode,
     write_robomimic,
 )
+from lab.demonstrations.scripted.experts import EXPERTS
 from lab.demonstrations.scripted.operators import OPERATORS
-from lab.demonstrations.scripted.tasks import EXPERTS
 from lab.io.workers import available_cores, working
 from warmprior.checks import check_between, check_choice, check_whole_numbers, given
 from warmprior.envs.control_loop import ControlLoop

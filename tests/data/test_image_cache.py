@@ -17,7 +17,7 @@ import h5py
 
 from tests.errors import missing, raises
 from tests.processes import apart
-from warmprior.data import DatasetError, frames, open_demonstrations
+from warmprior.data import DatasetError, image_cache, open_demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
 
 STEPS = 6
@@ -71,7 +71,7 @@ def test_what_decides_about_the_values_is_the_key(recorded, read, monkeypatch):
     with h5py.File(elsewhere, "a") as file:
         file["data/demo_1/obs/front"][STEPS - 1] = 7
     assert (front(elsewhere)[-1] == 7).all() and len(read) == 2
-    monkeypatch.setattr(frames, "version", lambda package: "another")
+    monkeypatch.setattr(image_cache, "version", lambda package: "another")
     front(elsewhere)
     assert len(read) == 4
 
@@ -199,10 +199,10 @@ def test_a_full_cache_loses_what_was_used_longest_ago(recorded, read, monkeypatc
         os.utime(found[age], (time.time() - 30 * age * 86_400,) * 2)
     front(path, image_size=10)  # a use keeps it
     later = 2 * STEPS * 3 * 16**2
-    monkeypatch.setattr(frames, "CACHE_BYTES", later + sum(found[n].stat().st_size for n in (3, 2, 0.5)))
+    monkeypatch.setattr(image_cache, "CACHE_BYTES", later + sum(found[n].stat().st_size for n in (3, 2, 0.5)))
     front(path)
     assert not found[4].exists() and all(found[age].exists() for age in (3, 2, 0.5))
-    monkeypatch.setattr(frames, "CACHE_BYTES", 0)
+    monkeypatch.setattr(image_cache, "CACHE_BYTES", 0)
     front(path, image_size=9)
     assert not found[2].exists() and all(found[age].exists() for age in (3, 0.5))
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from tests.errors import raises
-from warmprior.data import DatasetError, images
+from warmprior.data import DatasetError, image_check
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 
 SHOWN = np.random.default_rng(0).integers(0, 256, (8, 8, 3)).astype(np.uint8)
@@ -49,13 +49,13 @@ def test_images_are_those_of_the_simulator_or_refused(square_file, monkeypatch, 
     model = SimpleNamespace(nq=30, nv=14)
     renderer = SimpleNamespace(model=model, render=lambda camera, joints: SHOWN)
     simulator = SimpleNamespace(sim=SimpleNamespace(model=SimpleNamespace(_model=model)))
-    monkeypatch.setattr(images, "make_simulator", lambda env_args: simulator)
-    monkeypatch.setattr(images, "scene_stays", lambda env: name != "fixtures")
-    monkeypatch.setattr(images, "CameraRenderer", lambda *args, **options: renderer)
+    monkeypatch.setattr(image_check, "make_simulator", lambda env_args: simulator)
+    monkeypatch.setattr(image_check, "scene_stays", lambda env: name != "fixtures")
+    monkeypatch.setattr(image_check, "CameraRenderer", lambda *args, **options: renderer)
     demonstrations = RobomimicDemonstrations(path)
     index = demonstrations.index(images=["agentview_image"])
     if facts is None:
-        images.check_images(demonstrations, index, fast=False)
+        image_check.check_images(demonstrations, index, fast=False)
     else:
         with raises(DatasetError, path.name, *facts):
-            images.check_images(demonstrations, index, fast=False)
+            image_check.check_images(demonstrations, index, fast=False)

@@ -121,7 +121,7 @@ class _Steps(Demonstrations):
             lengths=tuple(lengths.tolist()),
             observation_keys=(OBSERVATION,),
             observation_dims=(self._values[self._vector].shape[-1],),
-            **self.pictured(list(self._images), self._images),
+            **self.image_entries(list(self._images), self._images),
             available_keys=(OBSERVATION, *self._images, *self._others),
             taken_by=dict.fromkeys(self._others, ""),
             action_dim=self._values[ACTION].shape[-1],
