@@ -21,8 +21,6 @@ PLUGIN = ROOT / "plugins" / "lerobot_policy_warmprior"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NAME = f"warmprior-{PROJECT['version']}"
 
-pytestmark = pytest.mark.slow
-
 
 def run(*command, cwd):
     """Run a command as if this process had not prepared anything for it."""
@@ -76,7 +74,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     assert f"{NAME}.dist-info/licenses/LICENSE" in info
     assert f"\nVersion: {PROJECT['version']}\n" in metadata
     needed = re.findall(r"^Requires-Dist: ([\w-]+)[^;\n]*$", metadata, re.M)
-    others = {"safetensors", "filelock", "psutil", "tqdm", "tyro"}
+    others = {"cloudpickle", "safetensors", "filelock", "psutil", "tqdm", "tyro"}
     assert set(needed) == {"torch", "tensordict", "torchrl"} | others
 
 
@@ -102,21 +100,23 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
         assert {i.filename: i.CRC for i in mine.infolist()} == {i.filename: i.CRC for i in again.infolist()}
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(python, tmp_path):
     printed = run(python, "-m", "warmprior", "--version", cwd=tmp_path)
     assert printed == f"warmprior {PROJECT['version']}\n"
     where = run(python, "-c", "import warmprior; print(warmprior.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(python.parents[1])
     text = (ROOT / "docs" / "quickstart.md").read_text()
-    code, *_ = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    code, said, *_ = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)
     (tmp_path / "quickstart.py").write_text(code)
     printed = run(python, "quickstart.py", cwd=tmp_path)
-    assert [line.split(",")[0] for line in printed.splitlines()[:6]] == ["gaussian"] * 3 + ["past"] * 3
+    assert re.sub(r"\d+%", "%", printed) == re.sub(r"\d+%", "%", said)
     printed = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
     assert "PastPrior(chunk_length=4" in printed
     assert f"warmprior {PROJECT['version']}, format {FORMAT}" in printed
 
 
+@pytest.mark.slow
 def test_a_simulated_policy_trains_and_plays_with_the_wheel_alone(python, tmp_path):
     pytest.importorskip("robosuite")
     write_robomimic_file(tmp_path / "lift.hdf5", lengths=(30, 40), task="lift")
@@ -140,6 +140,7 @@ EVALUATE = """--policy.path=run/checkpoints/last/pretrained_model --policy.devic
 --env.episode_length=20 --output_dir=evaluation"""
 
 
+@pytest.mark.slow
 def test_the_plugin_trains_and_plays_with_the_wheels_alone(python, tmp_path):
     for package in ("lerobot", "accelerate", "robosuite"):
         pytest.importorskip(package)

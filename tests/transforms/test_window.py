@@ -1,5 +1,6 @@
 """Training windows against loops in plain Python and against TorchRL's own sequence sampler."""
 
+import logging
 import warnings
 
 import pytest
@@ -168,6 +169,13 @@ def test_episodes_that_are_too_short_for_a_warm_source_are_named():
         warnings.simplefilter("error")
         assert window_replay_buffer(steps([3, 5]), PastPrior(4), batch_size=2)
         assert window_replay_buffer(steps([3, 4]), PreviewPrior(4), batch_size=2)
+
+
+def test_a_buffer_says_nothing_where_a_script_prints(caplog, monkeypatch):
+    """TorchRL writes there which transforms have lost what held them."""
+    monkeypatch.setattr(logging.getLogger("torchrl"), "propagate", True)
+    window_replay_buffer(steps([20]), PastPrior(2), batch_size=4, see_history=True, withhold=0.5).sample()
+    assert not caplog.messages
 
 
 def test_without_withholding_nothing_is_drawn_but_the_steps():

@@ -289,7 +289,8 @@ def window_replay_buffer(
         (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
-    window, *others = window_transforms(data, prior, generator=generator, **options)
+    transforms = window_transforms(data, prior, generator=generator, **options)
+    window = transforms[0]
     if isinstance(prior, PastPrior) and (reach := int(window.steps.max())) < prior.chunk_length:
         words = f"no episode has more than {reach + 1} steps, so {prior} is never warm: shorten the chunk"
         warnings.warn(words, stacklevel=1)  # from one place, so the two buffers of a training warn once
@@ -297,7 +298,7 @@ def window_replay_buffer(
         storage=_WindowStorage(window),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
-        transform=Compose(*others) if others else None,
+        transform=transforms[1:] if len(transforms) > 1 else None,
         generator=generator,
     )
 
