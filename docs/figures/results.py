@@ -58,7 +58,11 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
     "Push-T, 206 human": ("pusht_206_45000", "pusht_206_80000"),
 }
 WARM = (PAST, PREVIEW, CORRELATED)
-AGENTS = "agents_lift"
+LIFT_AGENTS = "agents_lift"
+AGENTS = {
+    "weak policies on lift, three seeds": LIFT_AGENTS,
+    "a policy on square, one training": "agents_square_mh_5000",
+}
 
 
 def gains() -> DataFrame:
@@ -133,19 +137,21 @@ def iterations() -> None:
 
 def agents() -> None:
     """Draw chart D: success of agents in source space, the mean over seeds and every seed."""
-    rows = read_arms(AGENTS).query("centre != 'zero'")
-    picture, (axis,) = figure(WIDTH, 4.4, 1, "Agents in the source space of weak policies on lift")
-    for arm, part in rows.groupby("arm", sort=False):
-        _, color, _ = SOURCES[part["prior"].iloc[0]]
-        style, mark = ("--", "s") if part["algorithm"].iloc[0] == "dsrl-sac" else ("-", "o")
-        for _, curve in part.groupby("seed"):
-            rates = 100 * curve["success_rate"]
-            axis.plot(curve["environment_steps"], rates, style, color=color, lw=0.7, alpha=0.4)
-        mean = part.groupby("evaluated")[["environment_steps", "success_rate"]].mean()
-        rates = 100 * mean["success_rate"]
-        axis.plot(mean["environment_steps"], rates, style, color=color, lw=2, marker=mark, ms=5, label=arm)
-    finish(axis, "greedy agents, NFE 1; thin lines are seeds", xlabel="control steps", ylim=(-3, 103))
-    axis.set_ylabel("success in percent")
+    picture, axes = figure(WIDTH, 4.4, len(AGENTS), "Agents in the source space of frozen policies")
+    for axis, (task, name) in zip(axes, AGENTS.items(), strict=True):
+        for arm, part in read_arms(name).query("centre != 'zero'").groupby("arm", sort=False):
+            _, color, _ = SOURCES[part["prior"].iloc[0]]
+            style, mark = ("--", "s") if part["algorithm"].iloc[0] == "dsrl-sac" else ("-", "o")
+            for _, curve in part.groupby("seed"):
+                rates = 100 * curve["success_rate"]
+                axis.plot(curve["environment_steps"], rates, style, color=color, lw=0.7, alpha=0.4)
+            mean = part.groupby("evaluated")[["environment_steps", "success_rate"]].mean()
+            rates = 100 * mean["success_rate"]
+            axis.plot(
+                mean["environment_steps"], rates, style, color=color, lw=2, marker=mark, ms=5, label=arm
+            )
+        finish(axis, task, xlabel="control steps", ylim=(-3, 103))
+    axes[0].set_ylabel("success in percent")
     save(picture, "agents")
 
 

@@ -14,10 +14,10 @@ from comparisons import Comparison
 from leaderboard import LEARNED_L1, SCRIPTED, beside_source, paper_gain, standings
 from pandas import DataFrame
 from results import (
-    AGENTS,
     CHOICES,
     GROUPS,
     LENGTHS,
+    LIFT_AGENTS,
     LONG,
     MANY,
     SHORT,
@@ -87,7 +87,7 @@ def beside_gaussian(runs: Iterable[str], source: str) -> str:
 
 def improved(arm: str) -> str:
     """Return the mean success of the policies of agents on lift, and of the agents in the end."""
-    rates = read_arms(AGENTS).query("arm == @arm").groupby("evaluated")["success_rate"].mean()
+    rates = read_arms(LIFT_AGENTS).query("arm == @arm").groupby("evaluated")["success_rate"].mean()
     return f"{whole(100 * rates.iloc[0])}% to {whole(100 * rates.iloc[-1])}%"
 
 

@@ -195,7 +195,8 @@ def arms_table(name: str) -> str:
     for arm, part in rows.groupby("arm", sort=False):
         rates = 100 * part.groupby("evaluated")["success_rate"].mean() + 1e-6
         last = 100 * part.groupby("seed")["success_rate"].last() + 1e-6
-        cells = [*(f"{rate:.0f}" for rate in rates), ", ".join(f"{rate:.0f}" for rate in last)]
+        cells = ["" if np.isnan(rate) else f"{rate:.0f}" for rate in rates.reindex(steps.index)]
+        cells += [", ".join(f"{rate:.0f}" for rate in last)]
         text.append(f"| {arm} | {' | '.join(cells)} |")
     return "\n".join(text) + "\n"
 
