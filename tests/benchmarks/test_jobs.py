@@ -25,6 +25,7 @@ from tests.benchmarks.script_parts import options, stored
 from tests.errors import raises
 from tests.processes import apart
 from warmprior.io.script import run_script
+from warmprior.io.workers import end_with_parent
 
 
 class AwkwardError(Exception):
@@ -204,6 +205,7 @@ def fail():
 
 def resumed(out, argv):
     """Run a command line on what an earlier call left, with a log."""
+    end_with_parent()
     resume = ["--resume"] if (out / "options.json").exists() else []
     with (out.parent / "log.txt").open("a", buffering=1) as log:
         os.dup2(log.fileno(), 1), os.dup2(log.fileno(), 2)
@@ -220,6 +222,9 @@ def results(out):
 KILLS = int(os.environ.get("KILLS", "20"))
 """How often a run is killed; more in a search for rare moments."""
 
+LIMIT = 900
+"""Seconds after which an undisturbed run hangs."""
+
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(
@@ -229,8 +234,9 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(
     monkeypatch.setattr(pictures, "rendering_backend", lambda: None)
     for module in ("lab.running.comparison", "lab.running.policies", "lab.reporting.report", "robosuite"):
         importlib.import_module(module)  # what is imported here costs the forks no time
-    few = {"iterations": 60, "save_every": 4, "checkpoints": 2, "episodes": 2, "prior": "past"}
+    few = {"iterations": 600, "save_every": 20, "checkpoints": 2, "episodes": 2, "prior": "past"}
     rng, kills, runs, duration, expected = np.random.default_rng(0), 0, 0, np.inf, None
+    assert KILLS > 0
     while kills < KILLS:
         out, code, runs = tmp_path / str(runs) / "out", None, runs + 1
         most = 0 if expected is None else min(KILLS, kills + 10)  # the first run is undisturbed
@@ -241,8 +247,9 @@ def test_a_run_that_is_killed_at_random_moments_resumes_to_the_same_result(
             process = multiprocessing.get_context("fork").Process(target=resumed, args=(out, argv))
             process.start()
             os.setpgid(process.pid, process.pid)
-            process.join(None if kills == most else rng.uniform(0, 0.9) * duration)
+            process.join(LIMIT if kills == most else rng.uniform(0, 0.9) * duration)
             if (code := process.exitcode) is None:
+                assert kills < most, f"it hangs:\n{(out.parent / 'log.txt').read_text()}"
                 os.killpg(process.pid, signal.SIGKILL)
                 process.join()
                 kills += 1

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from tests.errors import missing, raises
 from warmprior import PastPrior
 from warmprior.__main__ import main
-from warmprior.data import Demonstrations, demonstrations_of, open_demonstrations, opening
+from warmprior.data import DatasetError, Demonstrations, demonstrations_of, open_demonstrations, opening
 from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.options.data import PLACES
 from warmprior.saving import load_policy
@@ -104,6 +104,16 @@ def test_steps_in_memory_are_demonstrations():
     for options in ({"observations": ["observation"]}, {"images": ["front"]}):
         with raises(ValueError, "observations", "images"):
             Task(demonstrations_of(steps()), **options)
+
+
+@pytest.mark.parametrize("key", ["observation", "action"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int64])
+def test_steps_in_memory_whose_numbers_float32_would_round(key, dtype):
+    rounded = steps()
+    rounded[key] = (10**8 + torch.arange(30)[:, None]).to(dtype)
+    with raises(DatasetError, key, "arm", "column 0", 8, "offset"):
+        Task(demonstrations_of(rounded, "arm"))
+    Task(demonstrations_of(rounded, "arm", normalised=True))
 
 
 def test_steps_and_their_demonstrations_train_the_same_policy():

@@ -201,16 +201,17 @@ def test_large_numbers_whose_steps_float32_would_lose(square_file, key, name):
     offset, step = OFFSETS[name]
 
     def write(values):
+        """Write a column that rests in the first demo, and begins elsewhere in each of the others."""
         with h5py.File(path, "a") as file:
-            for demo in file["data"].values():
-                column = values(np.arange(len(demo["actions"])))
+            for number, demo in enumerate(file["data"].values()):
+                column = values(np.arange(len(demo["actions"])) * (number > 0)) + 1000 * number
                 old = demo[key][()].astype(column.dtype)
                 old[:, 2] = column
                 replace(demo, key, old)
 
     write(lambda t: offset + step * t)
-    facts = "column 2", f"{np.spacing(np.float32(offset)):g}", "offset"
-    unreadable(path, f"data/demo_0/{key}", *facts, steps={"actions": "stored"})
+    facts = "column 2", f"{np.spacing(np.float32(offset + 1000)):g}", f"{step:g}", "offset"
+    unreadable(path, f"data/demo_1/{key}", *facts, steps={"actions": "stored"})
     # Without the offset, in large steps, at rest, or as they were recorded in float32.
     for values in (
         lambda t: step * t,

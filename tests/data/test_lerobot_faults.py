@@ -84,6 +84,23 @@ def unknown_codec(root):
     (root / MOVIE).write_bytes(content.replace(b"av01", b"none"))
 
 
+def unknown_codec_beside_a_picture(root):
+    old, new = root / MOVIE, root / "new.mp4"
+    with av.open(old) as source, av.open(new, "w") as file:
+        video = file.add_stream_from_template(source.streams.video[0], opaque=True)
+        picture = file.add_stream("mjpeg", rate=20)
+        picture.width = picture.height = 64
+        picture.pix_fmt = "yuvj420p"
+        black = av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8)).reformat(format="yuvj420p")
+        black.pts = 0
+        packets = [*picture.encode(black), *picture.encode(), *source.demux(video=0)]
+        for packet in (packet for packet in packets if packet.dts is not None):
+            packet.stream = picture if packet.stream is picture else video
+            file.mux(packet)
+    new.replace(old)
+    unknown_codec(root)
+
+
 def description(content):
     return lambda root: (root / "meta" / "warmprior.json").write_text(content)
 
@@ -153,7 +170,7 @@ META = {
     "text": (described(observations={"object": ["observation.environment_state", "0", 10]}), PLACED),
     "text of masks": (described(observations=STATE, masks={"train": "all"}), ["warmprior.json", "masks"]),
     "no JSON": (cut("meta/info.json"), ["LeRobot"]),
-    "no steps": (table(EPISODES, length=lambda lengths: [7, 0, 9]), ["without steps"]),
+    "no steps": (table(EPISODES, length=lambda lengths: [7, 0, 9]), ["demonstration 1", "no steps"]),
     "no episodes": (without(EPISODES), ["meta/episodes/*/*.parquet", "finalize()"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps", 30, "Lift", 20]),
     "no action": (
@@ -178,7 +195,7 @@ VALUES = {
     "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
     "dropped frames": (
         table(DATA, timestamp=entry(slice(12, 16), [1.0] * 4, None)),
-        ["episode 2", "row 4", 20],
+        ["episode 2", "row 5", 20],
     ),
     "other episodes": (table(DATA, episode_index=entry(6, 0, None)), ["meta/episodes", "finalize()"]),
 }
@@ -202,6 +219,7 @@ IMAGES = {
     "cut-off video": (cut(MOVIE), ["file-000.mp4"], "side_image"),
     "sound": (sound, [MOVIE, "observation.images.side", "codec", "audio"], "side_image"),
     "unknown codec": (unknown_codec, [MOVIE, "observation.images.side", "codec"], "side_image"),
+    "unknown codec beside a picture": (unknown_codec_beside_a_picture, [MOVIE, "codec"], "side_image"),
     "outside": (
         info_of("data_path", "../{chunk_index}/{file_index}.parquet"),
         ["'../0/0.parquet'", "folder"],

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from warmprior.checks import check_keys
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.index import BLOCK, DatasetIndex
+from warmprior.data.index import BLOCK, DatasetIndex, check_kept
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE
 from warmprior.modules.resize import resized
 from warmprior.options.data import Resize
@@ -134,6 +134,9 @@ class _Steps(Demonstrations):
     @override
     def steps(self, *_: Any, **__: Any) -> TensorDictBase:
         index, values = self.index(), self._values.clone(False)
+        for key in () if self.normalised else (self._vector, ACTION):
+            exact = values[key].detach().cpu()
+            check_kept(exact.numpy(), exact.float().numpy(), f"{key!r} of {self.title}")
         for key in index.image_keys:
             size, blocks = (index.image_size,) * 2, values[OBSERVATION, key].split(BLOCK)
             if self._images[key] != size:

@@ -27,7 +27,7 @@ from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
 LARGE = 1e5
-"""The size from which on numbers may have an offset that takes the precision of their steps."""
+"""The size from which on numbers count as having an offset, which takes the precision of their steps."""
 
 MISFIT = "They do not fit these actions: correct one or the other."
 
@@ -93,11 +93,11 @@ class DatasetIndex:
     joints: str = ""
 
     def __post_init__(self) -> None:
-        if not self.demos or not all(self.lengths):
-            what = (
-                "a demonstration without steps" if self.demos else "no demonstration, or the mask names none"
-            )
-            raise DatasetError(f"{self.path}: there is {what}: choose others")
+        if not self.demos:
+            raise DatasetError(f"{self.path}: there is no demonstration, or the mask names none")
+        if 0 in self.lengths:
+            empty = self.demos[self.lengths.index(0)]
+            raise DatasetError(f"{self.path}: demonstration {empty} has no steps: delete it")
         if not self.observation_keys:
             listed = ", ".join(self.available_keys)
             raise DatasetError(f"{self.path}: no observations are chosen; name observations: {listed}")
@@ -235,15 +235,22 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, fir
             f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g} (of time stamps, those "
             f"since the first). {advice}"
         )
+    check_kept(block.reshape(out.shape), out, what)
 
 
 def check_kept(exact: np.ndarray, kept: np.ndarray, what: str) -> None:
-    """Raise DatasetError if float32 changes a tenth of how numbers ``[N, d]`` differ from row to row."""
-    changes, steps = (np.square(np.diff(rows, axis=0)).sum(0) for rows in (kept - exact, exact))
-    if (lost := changes > 0.01 * steps).any():
-        column = int(lost.argmax())
-        largest = np.abs(kept[:, column]).max()
-        raise DatasetError(
-            f"{what} has numbers up to {largest:g} in column {column}, where those of float32 are "
-            f"{np.spacing(largest):g} apart, too coarse for their steps: subtract an offset, or leave it out"
-        )
+    """Raise DatasetError if a column ``[N]`` of large numbers loses a tenth of its steps, in the median."""
+    if exact.dtype == kept.dtype:
+        return
+    exact, kept = (values.reshape(len(values), -1) for values in (exact, kept))
+    largest = np.abs(kept).max(0, initial=0)
+    for column in np.flatnonzero(largest >= LARGE):
+        before, after = (values[:, column].astype(np.float64) for values in (exact, kept))
+        steps, lost = np.abs(np.diff(before)), np.abs(np.diff(after - before))
+        moved = steps > 1e-12 * largest[column]  # by more than the last bits of float64
+        if moved.any() and np.median(lost[moved]) > 0.1 * np.median(steps[moved]):
+            raise DatasetError(
+                f"{what} has numbers up to {largest[column]:g} in column {column}, where those of float32 "
+                f"are {np.spacing(np.float32(largest[column])):g} apart, too coarse for steps of "
+                f"{np.median(steps[moved]):g}: subtract an offset, or leave it out"
+            )

@@ -17,12 +17,10 @@ from warmprior.checks import check_choice
 from warmprior.data.image_cache import image_shape, read_images
 from warmprior.data.index import (
     BLOCK,
-    LARGE,
     MISFIT,
     DatasetError,
     DatasetIndex,
     DemonstrationReader,
-    check_kept,
     declared_poses,
     reading,
 )
@@ -226,25 +224,15 @@ def _fill(
     read_actions: Callable[[str, np.ndarray], None],
 ) -> None:
     observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
-    keys = [*(f"obs/{key}" for key in index.observation_keys), "actions", "rewards"]
-    parts = np.split(observation, np.cumsum(index.observation_dims)[:-1], 1)
-    arrays = dict(zip(keys, [*parts, action, data["next", "reward"].numpy()], strict=True))
+    reward = data["next", "reward"].numpy()
+    columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
-
-    def read(arrays: Mapping[str, np.ndarray]) -> None:
-        for demo, (start, stop) in zip(index.demos, pairwise(rows), strict=True):
-            for key, out in arrays.items():
-                if key == "actions":
-                    read_actions(demo, out[start:stop])
-                else:
-                    reader.numbers(demo, key, out[start:stop])
-
-    read(arrays)
-    for key, kept in arrays.items():
-        if max(kept.max(initial=0), -kept.min(initial=0)) >= LARGE:
-            read({key: (exact := np.empty(kept.shape))})
-            check_kept(exact, kept, reader.name(index.demos[0], key))
-    data[EPISODE] = torch.repeat_interleave(torch.tensor(index.lengths))
+    for episode, (demo, (start, stop)) in enumerate(zip(index.demos, pairwise(rows), strict=True)):
+        for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
+            reader.numbers(demo, f"obs/{key}", observation[start:stop, left:right])
+        read_actions(demo, action[start:stop])
+        reader.numbers(demo, "rewards", reward[start:stop])
+        data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)
     ended = solved(data["next", "reward"][last], index.env_args)

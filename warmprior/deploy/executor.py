@@ -145,7 +145,7 @@ class AsyncExecutor:
         self._shape = (length, action_dim)
         # LeRobot's weights are not among the actor's.
         self._device = getattr(plain, "device", None) or device_of(actor)
-        # Guidance raises an error for delays longer than its horizon.
+        # Guidance raises an error for delays longer than its execution horizon.
         guidance = getattr(getattr(plain, "ode", None), "guidance", None)
         self._reach = getattr(guidance, "execution_horizon", None) or length
         self._statistics = normalizer

@@ -146,7 +146,7 @@ def _fitted(name: str, value: Any, shape: tuple[int, ...], resize: Resize) -> Te
     array = _copied(name, value)
     if len(shape) != 3:
         check_shape(name, array, shape)
-        return array if array.is_floating_point() else array.double()
+        return array if array.is_floating_point() else array.float()
     image = array if array.ndim != 3 or len(array) == 3 else array.movedim(-1, 0)
     if image.dtype != torch.uint8 or image.ndim != 3 or len(image) != 3 or not image.numel():
         raise ValueError(

@@ -61,8 +61,8 @@ class RawUnits(nn.Module):
 class Normalizer(RawUnits):
     """Maps every dimension of every key to ``[-1, 1]`` with the data's minimum and maximum (Table 3).
 
-    A dimension counts as constant, and is only shifted, if half its range is at most 1 and at most ``1e-5 *
-    max(1, |midpoint|)``, the rounding noise of a body at rest. The statistics are buffers; they keep their
+    A dimension counts as constant, as the rounding noise of a body at rest is, if half its range is at most 1
+    and at most ``1e-5 * max(1, |midpoint|)``; it is only shifted. The statistics are buffers; they keep their
     precision where a policy is cast to a lower one.
 
     Args:
@@ -168,9 +168,8 @@ class Normalizer(RawUnits):
             value, loc = data.get(key, None), self.loc(key)
             if value is not None:
                 check_width(key, value.shape, loc)
-                exact = value if value.is_floating_point() else value.double()  # of large integers too
-                units = (exact - loc) / self.scale(key)
-                data.set(key, units.to(torch.promote_types(value.dtype, loc.dtype)))
+                value = value if value.is_floating_point() else value.to(loc.dtype)
+                data.set(key, (value - loc) / self.scale(key))
         return data
 
     def denormalize(self, data: TensorDictBase) -> TensorDictBase:

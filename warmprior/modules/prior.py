@@ -125,7 +125,7 @@ class Prior(Registered):
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Check the result of :meth:`Prior.mean`, and return it in the history's dtype."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
-    if type(prior).mean.__module__ == __name__:
+    if getattr(prior.mean, "__module__", None) == __name__:
         return prior.mean(history)
     # A mean of a user's own may write into what it reads, which the environment keeps.
     mean, forecast = prior.mean(history.clone()), history.get("forecast")

@@ -19,7 +19,8 @@ PLACES = (
 IMAGE_SIZE = 84
 """The default side of images in pixels, as in the paper (Table 3).
 
-:meth:`~warmprior.data.Demonstrations.image_entries` takes it for images of several shapes, or not square.
+Without an image size, :meth:`~warmprior.data.Demonstrations.image_entries` takes it for images of several
+shapes, or that are not square.
 """
 
 IMAGE_SIZES = (8, 1024)

@@ -51,8 +51,7 @@ class FloatNorm(FollowsNormalizer, ObservationNorm):
     """TorchRL's transform, for integers and flags too: its specs would keep their type, and buffers cut."""
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        exact = obs if obs.is_floating_point() else obs.double()
-        return super()._apply_transform(exact).to(torch.promote_types(obs.dtype, self.loc.dtype))
+        return super()._apply_transform(obs if obs.is_floating_point() else obs.to(self.loc.dtype))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Set the spec of what is normalised, which has the precision of the statistics, or a higher one."""

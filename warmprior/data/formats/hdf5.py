@@ -251,7 +251,7 @@ def _check_count(group: h5py.Group, name: str, steps: int) -> None:
     what = f"{_place(group)}.attrs[{name!r}]"
     with indices.reading(what, _AGAIN):
         count = group.attrs.get(name)
-        differs = count is not None and int(count) != steps
+        differs = count is not None and int(np.asarray(count).item()) != steps
     if differs:
         raise DatasetError(
             f"{what} counts {count} steps, but there are {steps}: a demo is missing, incomplete or padded. "

@@ -111,7 +111,7 @@ def write_robomimic(
     """Write episodes to a file that robomimic's reader opens, and return its number of samples.
 
     ``seed`` seeds the random split into filter keys; ``model_file`` is the simulator's XML. Its files are
-    named from robosuite's folder on, where robosuite looks for them, so every machine writes the same bytes.
+    named from robosuite's folder on, where robosuite looks for them: no file holds a path of its machine.
     """
     h5py = require("h5py", "sim")
     model_file = re.sub(r'file="[^"]*/robosuite/', 'file="robosuite/', model_file)
