@@ -144,13 +144,11 @@ def agents() -> None:
             style, mark = ("--", "s") if part["algorithm"].iloc[0] == "dsrl-sac" else ("-", "o")
             for _, curve in part.groupby("seed"):
                 rates = 100 * curve["success_rate"]
-                axis.plot(curve["environment_steps"], rates, style, color=color, lw=0.7, alpha=0.4)
+                axis.plot(curve["environment_steps"] / 1_000, rates, style, color=color, lw=0.7, alpha=0.4)
             mean = part.groupby("evaluated")[["environment_steps", "success_rate"]].mean()
-            rates = 100 * mean["success_rate"]
-            axis.plot(
-                mean["environment_steps"], rates, style, color=color, lw=2, marker=mark, ms=5, label=arm
-            )
-        finish(axis, task, xlabel="control steps", ylim=(-3, 103))
+            shown = {"color": color, "lw": 2, "marker": mark, "ms": 5, "label": arm}
+            axis.plot(mean["environment_steps"] / 1_000, 100 * mean["success_rate"], style, **shown)
+        finish(axis, task, xlabel="thousand control steps", ylim=(-3, 103))
     axes[0].set_ylabel("success in percent")
     save(picture, "agents")
 
