@@ -61,7 +61,7 @@ WARM = (PAST, PREVIEW, CORRELATED)
 LIFT_AGENTS = "agents_lift"
 AGENTS = {
     "weak policies on lift, three seeds": LIFT_AGENTS,
-    "a policy on square, one training": "agents_square_mh_5000",
+    "policies on square, one training each": "agents_square_mh_5000",
 }
 
 
