@@ -107,8 +107,7 @@ IMPROVE = PriorSpaceConfig(
     updates=4,
     noise_critic_steps=2,
     hidden_dim=256,
-    gamma=0.95,  # values of more decisions take longer to learn than these runs last
-    tau=0.02,
+    gamma=0.98,
     # At 1, the entropy of a chunk would be worth more than a success until the temperature has fallen.
     alpha_init=0.05,
     evaluate_every=10_000,
