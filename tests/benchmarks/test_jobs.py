@@ -220,7 +220,7 @@ def results(out):
 
 
 KILLS = int(os.environ.get("KILLS", "20"))
-"""How often a run is killed; more in a search for rare moments."""
+"""A run is killed this often; set more in a search for rare moments."""
 
 LIMIT = 900
 """Seconds after which an undisturbed run hangs."""
