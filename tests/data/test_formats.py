@@ -114,6 +114,7 @@ def test_steps_in_memory_whose_numbers_float32_would_round(key, dtype):
     with raises(DatasetError, key, "arm", "column 0", 8, "offset"):
         Task(demonstrations_of(rounded, "arm"))
     Task(demonstrations_of(rounded, "arm", normalised=True))
+    Task(demonstrations_of(steps().apply(lambda v: v.bfloat16() if v.is_floating_point() else v), "arm"))
 
 
 def test_steps_and_their_demonstrations_train_the_same_policy():

@@ -136,7 +136,7 @@ class _Steps(Demonstrations):
         index, values = self.index(), self._values.clone(False)
         for key in () if self.normalised else (self._vector, ACTION):
             exact = values[key].detach().cpu()
-            check_kept(exact.numpy(), exact.float().numpy(), f"{key!r} of {self.title}")
+            check_kept(exact.double().numpy(), exact.float().numpy(), f"{key!r} of {self.title}")
         for key in index.image_keys:
             size, blocks = (index.image_size,) * 2, values[OBSERVATION, key].split(BLOCK)
             if self._images[key] != size:
