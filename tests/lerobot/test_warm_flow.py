@@ -42,6 +42,14 @@ def moments_for(policy, steps):
     return precondition(VelocityMLP(*sizes), steps, policy.actor.prior).moments.state_dict()
 
 
+def test_an_observation_that_is_not_there_is_named(found):
+    seen = one_observation()
+    del seen["observation.state"]
+    for act in (flow_policy(found).select_action, flow_policy(found).predict_action_chunk):
+        with raises(KeyError, "observation.state", "missing", "config.json", "input_features"):
+            act(seen)
+
+
 def test_the_average_follows_the_weights(found):
     policy = flow_policy(found)
     before = [weight.clone() for weight in policy.actor.network.parameters()]

@@ -37,7 +37,7 @@ from warmprior import (
     WithheldHistory,
     keys,
 )
-from warmprior.checks import check_choice
+from warmprior.checks import check_choice, check_keys
 from warmprior.data import open_demonstrations
 from warmprior.history import window_history
 from warmprior.lerobot.adapter import with_width
@@ -366,7 +366,9 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         return self._queues["action"].popleft()
 
     def _remember(self, batch: dict[str, Tensor]) -> None:
-        observations = {name: batch[name] for name in (*self.config.observed, *self._cameras)}
+        needed = *self.config.observed, *self._cameras
+        check_keys(batch, needed, "the policy", "; its config.json names them in input_features")
+        observations = {name: batch[name] for name in needed}
         self._memory.expect(len(batch[self.config.observed[0]]))
         self._queues = populate_queues(self._queues, observations)
 
