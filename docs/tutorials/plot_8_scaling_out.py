@@ -37,9 +37,8 @@ small = "--prior gaussian past --sigma 0.1 --hidden-dim 64 --iterations 300 --nf
 def compare(run, seeds, workers):
     """The rows of a comparison on the toy, and what it printed."""
     out = Path(folder.name) / run
-    options = (
-        f"{small} --seeds {seeds} --workers {workers} --out {out}".split()
-    )
+    more = f"--seeds {seeds} --workers {workers} --out {out}"
+    options = f"{small} {more}".split()
     command = [sys.executable, str(script), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     lines = (out / "results.jsonl").read_text().splitlines()

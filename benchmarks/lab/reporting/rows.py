@@ -1,9 +1,8 @@
 """Rows of results, written, and checked when they are read.
 
 A row is one JSON object in a file of lines. Its columns are defined in `columns.py`; their formats say their
-types. `write_rows` writes the file: for
-`compare` (`running/comparison.py`) once a row's episodes are played, and for `prior_space_rl.py`,
-`navigation1d.py` and `budget.py`.
+types. `write_rows` writes the file: for `compare` (`running/comparison.py`) once a row's episodes are played,
+and for `prior_space_rl.py`, `navigation1d.py` and `budget.py`.
 """
 
 from __future__ import annotations

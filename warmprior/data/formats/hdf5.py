@@ -236,7 +236,7 @@ def selected_demos(file: h5py.File, filter_key: str | None) -> tuple[str, ...]:
     for name in selected:
         if not (name.startswith("demo_") and name[5:].isdecimal()):
             raise DatasetError(f"{file.filename}: data/{name} is not called demo_<number>; rename the group")
-    return tuple(sorted(sorted(selected), key=lambda name: int(name[5:])))
+    return tuple(sorted(selected, key=lambda name: (int(name[5:]), name)))
 
 
 def read_described(file: h5py.File, name: str) -> Any:

@@ -70,7 +70,7 @@ class _HeapsChecked(io.FileIO):
             place += step
 
     def _header(self, place: int, length: int) -> tuple[int, int]:
-        """Return the number and the size in a header, 0 behind the end of the file."""
+        """Return the number and the size in a header; bytes behind the end of the file count as 0."""
         header = os.pread(self.fileno(), length, place)
         return int.from_bytes(header[:2], "little"), int.from_bytes(header[8 : 8 + self.size_bytes], "little")
 
