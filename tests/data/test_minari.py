@@ -103,7 +103,7 @@ def test_entries_of_dictionaries_are_chosen_by_name():
     for wrong, facts in (
         ({"observations": ["leg"]}, ("leg", "arm, goal/place")),
         ({"images": ["side"]}, ("side", "front")),
-        ({"images": ["arm"]}, ("arm (Box", "front")),
+        ({"images": ["arm"]}, ("'arm'", "front", "Box")),
     ):
         with raises(DatasetError, *facts):
             MinariDemonstrations(name).steps(**wrong)

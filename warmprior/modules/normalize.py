@@ -27,13 +27,17 @@ def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
         )
 
 
-def warn_of_tiny(half: Tensor, middle: Tensor) -> None:
-    """Warn of actions that count as constant although half their range is more than rounding noise."""
-    tiny = (half < LEAST) & (half > LEAST / 10 * middle.abs().clamp_min(0.01))
-    if tiny.any():
+def warn_of_constant(key: NestedKey, half: Tensor, middle: Tensor, constant: Tensor) -> None:
+    """Warn of dimensions that count as constant although half their range is more than rounding noise."""
+    # A body at rest moves by up to LEAST in a simulator; the size of an action is what somebody chose.
+    least = LEAST * 1e-3 if key == keys.ACTION else LEAST
+    rounding = 4 * torch.finfo(torch.float32).eps * middle.abs()
+    varies = constant & (half > rounding.clamp_min(least))
+    if varies.any():
+        which = [round(2 * float(value), 9) for value in half[varies]]
         warnings.warn(
-            f"the actions {tiny.nonzero().flatten().tolist()} vary by less than {2 * LEAST:g} and count as "
-            "constant: if they matter, give them in a smaller unit, such as millimetres",
+            f"of {key!r} the dimensions {varies.nonzero().flatten().tolist()} vary by {which} and count as "
+            "constant: if they matter, subtract an offset, or use a smaller unit, such as millimetres",
             stacklevel=3,
         )
 
@@ -99,8 +103,7 @@ class Normalizer(RawUnits):
             first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first
             constant = half <= LEAST * loc.abs().clamp(1.0, 1 / LEAST)
-            if key == keys.ACTION:
-                warn_of_tiny(half, loc)
+            warn_of_constant(key, half, loc, constant)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 

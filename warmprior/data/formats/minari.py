@@ -223,8 +223,8 @@ class MinariDemonstrations(Demonstrations):
         for kind, wanted, present in (("observation", chosen, vectors), ("image", images, pictures)):
             for key in wanted:
                 if key not in present:
-                    known = f"{key} ({spaces[key]})" if key in spaces else key
-                    raise unknown_name_error(where, kind, known, present)
+                    error = unknown_name_error(where, kind, key, present)
+                    raise DatasetError(f"{error} ({key!r} is {spaces[key]})") if key in spaces else error
         check_count(where, self.demos, dataset.total_episodes)
         episodes = [int(i) for i in dataset.episode_indices][: self.demos]
         whole = self.demos in (None, dataset.total_episodes)
