@@ -46,7 +46,7 @@ def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and number of iterations."""
     presets = {name: study(BudgetOptions, base, measured=1_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "budget", __doc__)
-    from lab.demonstrations.tasks import title_of
+    from lab.demonstrations.loading import title_of
     from lab.reporting.plots import plot_lines
     from lab.reporting.report import labelled, per_seed, table, write_report
     from lab.reporting.rows import PLAYED, RESULTS, read_rows, write_rows

@@ -33,7 +33,7 @@ def main(argv: list[str] | None) -> None:
     options = parse(presets, argv, "sigma", __doc__)
     import pandas as pd
 
-    from lab.demonstrations.tasks import title_of
+    from lab.demonstrations.loading import title_of
     from lab.measures.straightness import check_flows, straightness
     from lab.reporting.paper import paper_success
     from lab.reporting.plots import plot_lines

@@ -17,7 +17,7 @@ import tyro
 from warmprior.checks import check_device, check_whole_numbers, given
 from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
-from warmprior.options.agent import IMPROVE, Algorithm
+from warmprior.options.agent import IMPROVE, NUM_ENVS, Algorithm
 from warmprior.options.data import PLACES
 from warmprior.options.evaluation import EVALUATION_SEED
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
@@ -217,7 +217,7 @@ def improve(
     delta: float | None = None,
     residual_length: int | None = None,
     nfe: int | None = None,
-    num_envs: int = 4,
+    num_envs: int = NUM_ENVS,
     compile: bool = False,
     episodes: int = 100,
     seed: int = 0,
@@ -494,7 +494,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 config=(tyro.conf.OmitArgPrefixes,),  # --iterations, not --training.iterations
             )
         )
-        from warmprior.saving.checkpoint import AnotherRunError
+        from warmprior.saving.training_state import AnotherRunError
 
         try:
             parsed()

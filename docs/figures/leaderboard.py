@@ -21,6 +21,7 @@ from scipy.stats import t as student_t
 from shared import (
     DOCS,
     GAUSSIAN,
+    L1,
     OUT,
     PAST,
     PREVIEW,
@@ -152,7 +153,7 @@ def draw() -> None:
             part = frame[frame["source"] == source].sort_values("nfe")
             bars = np.abs(part[["mean_low", "mean_high"]].to_numpy().T - part["mean"].to_numpy())
             places = part["nfe"] * beside(k, len(shown))
-            line = "--" if source.endswith(",l1") else "-"
+            line = "--" if source.endswith(L1) else "-"
             axis.errorbar(places, part["mean"], bars, color=color, marker=mark, ls=line, lw=1.6, label=label)
         finish(axis, title, xlabel="network evaluations per chunk (NFE)")
         axis.set(xscale="log", ylim=(0, None))

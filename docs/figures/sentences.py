@@ -27,7 +27,7 @@ from results import (
     all_lengths,
     outcomes_by_length,
 )
-from shared import CORRELATED, CVAE, GAUSSIAN, PAST, PREVIEW, SOURCES, read_arms, read_cells, read_played
+from shared import CORRELATED, CVAE, GAUSSIAN, L1, PAST, PREVIEW, SOURCES, read_arms, read_cells, read_played
 
 
 def whole(number: float) -> int:
@@ -111,7 +111,7 @@ def sentences() -> dict[str, list[str]]:
     ]
     fewer, fewer_l1 = (
         [100 * (1 - board.loc[s, 1]["mean"] / board.loc[s, 9]["mean"]) for s in sources]
-        for sources in ((GAUSSIAN, *WARM), [f"{s},l1" for s in (GAUSSIAN, PAST, CORRELATED)])
+        for sources in ((GAUSSIAN, *WARM), [f"{s}{L1}" for s in (GAUSSIAN, PAST, CORRELATED)])
     )
     pusht = {
         count: {s: solved(run, s, 9) for s in (GAUSSIAN, *WARM)}
@@ -120,13 +120,13 @@ def sentences() -> dict[str, list[str]]:
     fifty = [whole(pusht[50][s]) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     past, preview_once, mip = (beside_source(*s) for s in ((PAST, 9), (PREVIEW, 1), ("mip", 2)))
-    cvae_l1 = partial(beside_source, f"{CVAE},l1", baseline=f"{GAUSSIAN},l1", sets=LEARNED_L1)
+    cvae_l1 = partial(beside_source, f"{CVAE},l1", baseline=f"{GAUSSIAN}{L1}", sets=LEARNED_L1)
     with_l1, with_l1_at_best = ({n: cvae_l1(n, own_noise=own) for n in (9, 1)} for own in (True, False))
     at_best = {n: beside_source(CVAE, n, own_noise=False) for n in (9, 3, 1)}
     past_once = beside_source(PAST, 1, sets=SCRIPTED)
     learned = {n: beside_source(CVAE, n) for n in (9, 1)}
     learned_mip = {n: beside_source(CVAE, n, "mip") for n in (9, 1)}
-    absolute = beside_source(f"{GAUSSIAN},l1", 9)
+    absolute = beside_source(f"{GAUSSIAN}{L1}", 9)
     agents = (
         f"WP-Past's agent rises from {improved(f'DSRL-NA, {SOURCES[PAST][0]}')}, "
         f"the Gaussian source's from {improved(f'DSRL-NA, {SOURCES[GAUSSIAN][0]}')}"
@@ -148,7 +148,7 @@ def sentences() -> dict[str, list[str]]:
             f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% of episodes at NFE 9 ({learned[9].chance} "
             "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
-            f"with an L1 loss {rates[f'{GAUSSIAN},l1', 9]}% at NFE 9 ({absolute.chance})",
+            f"with an L1 loss {rates[f'{GAUSSIAN}{L1}', 9]}% at NFE 9 ({absolute.chance})",
             agents,
             f"{paper[PAST]} points higher with WP-Past, and {paper[PREVIEW]} points higher with WP-Preview",
         ],

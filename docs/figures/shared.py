@@ -28,22 +28,16 @@ DATA, OUT = DOCS / "results", DOCS / "_static" / "results"
 GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
 CORRELATED = "past,correlation=0.5"
 CVAE = "cvae"
-SOURCES = {  # label, colour and marker in charts
-    GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
-    PAST: ("WP-Past", "#1f77b4", "o"),
-    PREVIEW: ("WP-Preview", "#d95f02", "o"),
-    CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
-    f"{GAUSSIAN},l1": ("Gaussian source, L1 loss", "#7f7f7f", "v"),
-    f"{PAST},l1": ("WP-Past, L1 loss", "#1f77b4", "v"),
-    f"{CORRELATED},l1": ("WP-Past, correlated noise, L1 loss", "#1b9e77", "v"),
-    "mip": ("MIP", "#a6761d", "s"),
-    "mip-past": ("MIP from WP-Past", "#a6761d", "D"),
-    "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", "#a6761d", "P"),
-}
-SOURCES |= {name: (each.label, each.color, "o") for name, each in METHODS.items() if name not in SOURCES}
+L1 = ",l1"  # ends the names of sources that were trained with an L1 loss
+_NAMED = {name: (each.label, each.color) for name, each in METHODS.items()}
+_NAMED |= {CORRELATED: ("WP-Past, correlated noise", "#1b9e77")}
+# Label, colour and marker in charts; tables have columns in this order.
+SOURCES = {name: (*_NAMED[name], "o") for name in (GAUSSIAN, PAST, PREVIEW, CORRELATED, *_NAMED)}
+SOURCES |= {f"{name}{L1}": (f"{text}, L1 loss", color, "v") for name, (text, color, _) in SOURCES.items()}
 SOURCES |= {
-    f"{name},l1": (f"{SOURCES[name][0]}, L1 loss", SOURCES[name][1], "v")
-    for name in (CVAE, f"{CVAE}-history")
+    "mip": (*_NAMED["mip"], "s"),
+    "mip-past": ("MIP from WP-Past", SOURCES["mip"][1], "D"),
+    "mip-past,correlation=0.5": ("MIP from WP-Past, correlated noise", SOURCES["mip"][1], "P"),
 }
 WIDTH = 5.6  # inches, so that text is readable at 400 pixels
 
@@ -57,7 +51,7 @@ def read_played(name: str) -> DataFrame:
     rows = read_json(DATA / f"{name}.jsonl", lines=True, dtype={"outcomes": str})
     options = rows["options"].where(rows["options"] == "", "," + rows["options"])
     noise = rows.get("temperature", Series(1.0, rows.index)).fillna(1.0)  # 1 if unnamed
-    loss = ",l1" if name.endswith("_l1") else ""
+    loss = L1 if name.endswith("_l1") else ""
     rows = rows.assign(source=rows["prior"] + options + loss, noise=noise)
     return rows.assign(solved=[np.array([*map(int, outcomes)]) for outcomes in rows["outcomes"]])
 

@@ -15,7 +15,7 @@ import torch
 from navigation1d import NAVIGATION_PRESETS
 from shared import DOCS, GAUSSIAN, INK, PAST, PREVIEW, SOURCES
 
-from lab.demonstrations.tasks import navigation_task
+from lab.demonstrations.loading import navigation_task
 from lab.measures.navigation import play_navigation
 from lab.reporting.plots import ABOVE, BELOW, new_figure
 from warmprior import GaussianPrior, PastPrior, PreviewPrior

@@ -11,7 +11,7 @@ import robomimic
 import torch
 from torch import nn
 
-from lab.demonstrations.tasks import navigation_task
+from lab.demonstrations.loading import navigation_task
 from lab.options.command_line import parse
 from lab.options.options import with_parts
 from lab.options.presets import IMAGES, PRESETS
@@ -32,7 +32,7 @@ from warmprior import (
 from warmprior.diagnostics import curvature, flow_paths
 from warmprior.envs.navigation1d import OBSTACLES, navigation_heights
 from warmprior.envs.robosuite_tasks import TASKS
-from warmprior.modules.schedule import warmup_cosine
+from warmprior.modules.learning_rate import warmup_cosine
 from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import delta_of
 from warmprior.training import NetworkOptions, TrainingConfig, make_network

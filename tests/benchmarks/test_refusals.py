@@ -24,7 +24,7 @@ def no_work(monkeypatch):
     loaders = ("generate_demonstrations", "download_robomimic")
     for place in (
         "lab.running.policies.train_policy",
-        *(f"lab.demonstrations.tasks.{name}" for name in loaders),
+        *(f"lab.demonstrations.loading.{name}" for name in loaders),
     ):
         monkeypatch.setattr(place, never)
     for place in ("warmprior.envs.rendering.require_rendering", "warmprior.envs.mimicgen.find_spec"):

@@ -17,7 +17,7 @@ from tests.benchmarks.script_parts import command_line, described, is_png, optio
 from tests.processes import apart
 from warmprior.envs import rendering_backend
 from warmprior.envs.robosuite_tasks import TaskSpec
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 
 
 def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypatch):

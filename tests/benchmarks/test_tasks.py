@@ -9,7 +9,7 @@ import robomimic
 import torch
 
 from lab.demonstrations.data_options import DataOptions
-from lab.demonstrations.tasks import load_task
+from lab.demonstrations.loading import load_task
 from lab.options.options import Options, with_parts
 from lab.options.stored_options import stored_options
 from lab.running.policies import policies_of
@@ -24,7 +24,7 @@ from warmprior.diagnostics import encoded_windows
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.robosuite_tasks import TASKS, TaskSpec
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 

@@ -10,8 +10,8 @@ from tests.data.hdf5_faults import unreadable
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import raises, refuses
 from warmprior.data import open_demonstrations
+from warmprior.data.checks import DatasetError
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader
-from warmprior.data.index import DatasetError
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):

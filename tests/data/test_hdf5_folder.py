@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.demonstrations.data_options import DataOptions
-from lab.demonstrations.tasks import load_task
+from lab.demonstrations.loading import load_task
 from tests.data.synthetic import write_robomimic_file
 from tests.data.test_recorded_actions import write as write_actions
 from tests.errors import missing, raises, refuses

@@ -44,8 +44,8 @@ from warmprior import (
 )
 from warmprior.history import cold_history
 from warmprior.modules.recording import Recording
-from warmprior.saving.checkpoint import load_state, module_tensors, named, save_state, snapshot_optimizer
 from warmprior.saving.policies import load_policy, policy_config, save_policy
+from warmprior.saving.training_state import load_state, module_tensors, named, save_state, snapshot_optimizer
 
 
 def make_rows(folder: Path) -> None:

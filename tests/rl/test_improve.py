@@ -20,7 +20,7 @@ from warmprior.io.workers import torch_threads
 from warmprior.rl import improve, improve_policy, improved_policy
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.saving import load_policy, save_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 
 
 class ReachEnv(SolvableEnv):

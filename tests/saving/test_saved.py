@@ -24,8 +24,8 @@ from warmprior import (
     keys,
 )
 from warmprior.modules.recording import Recording
-from warmprior.saving.checkpoint import load_state, save_state
 from warmprior.saving.policies import FORMAT, load_policy, policy_config, save_policy
+from warmprior.saving.training_state import load_state, save_state
 
 H, D_A, D_O, TO = 3, 2, 5, 2
 ACTION = "normalizer.action_scale"
@@ -123,7 +123,7 @@ def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
     assert torch.equal(chunk(again), chunk(actor))
 
 
-@pytest.mark.parametrize("where", ["os.replace", "warmprior.saving.checkpoint.save_file", "os.fsync"])
+@pytest.mark.parametrize("where", ["os.replace", "warmprior.saving.training_state.save_file", "os.fsync"])
 def test_a_full_disk_leaves_the_old_policy(tmp_path, monkeypatch, where):
     """Overwriting a policy must not leave new weights beside an old configuration."""
     saved(tmp_path)

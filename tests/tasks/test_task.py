@@ -11,7 +11,7 @@ from torchrl.envs import RenameTransform, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from lab.demonstrations.data_options import DataOptions
-from lab.demonstrations.tasks import load_task, longest_of, read_like, title_of
+from lab.demonstrations.loading import load_task, longest_of, read_like, title_of
 from tests.data.synthetic import write_robomimic_file
 from tests.errors import raises, refuses
 from tests.rl.test_images import CameraEnv

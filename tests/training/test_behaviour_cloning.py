@@ -26,7 +26,7 @@ from tests.training.cloning_parts import (
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
 from warmprior.options.training import PAPER
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 from warmprior.training import TrainingConfig
 from warmprior.training.optim import make_optimizer
 

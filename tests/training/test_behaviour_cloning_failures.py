@@ -11,7 +11,7 @@ from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, finished, mlp, training, weights
 from warmprior import PastPrior, PreviewPrior
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 
 
 def test_a_state_of_another_run(tmp_path):

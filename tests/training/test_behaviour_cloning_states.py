@@ -9,7 +9,7 @@ from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, finished, run_until, training, weights
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state, save_state
+from warmprior.saving.training_state import load_state, save_state
 
 
 def test_a_lost_policy_is_rebuilt_and_not_trained_again(tmp_path):

@@ -8,7 +8,7 @@ import dataclasses
 import pytest
 import torch
 
-from lab.demonstrations.tasks import navigation_task
+from lab.demonstrations.loading import navigation_task
 from tests.rl.training_parts import ALGORITHMS, make_actor, make_training
 from tests.states import copied, same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, training, weights
@@ -16,7 +16,7 @@ from tests.training.test_synchronisation import CASES
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.evaluation import evaluate
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 from warmprior.training import NetworkOptions, train_policy
 from warmprior.training.placement import placed
 

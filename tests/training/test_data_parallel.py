@@ -8,7 +8,7 @@ from tests.together import together
 from tests.training.cloning_parts import CONFIG
 from tests.training.data_parallel_parts import CASES, CLIPPED, STEPS, cloning, dies, whole
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from warmprior import CVAEPrior, GaussianPrior, PastPrior, PreviewPrior, Prior, 
 from warmprior.data import demonstrations_of
 from warmprior.deploy import AsyncExecutor
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state, save_state
+from warmprior.saving.training_state import load_state, save_state
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 

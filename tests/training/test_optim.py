@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from warmprior import VelocityMLP
-from warmprior.modules.schedule import warmup_cosine
+from warmprior.modules.learning_rate import warmup_cosine
 from warmprior.training.optim import ema_of, make_optimizer
 
 

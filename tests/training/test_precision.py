@@ -8,7 +8,7 @@ from tests.states import same
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, finished, mlp, weights
 from warmprior import FlowMatchingLoss, PastPrior, window_replay_buffer
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state
+from warmprior.saving.training_state import load_state
 from warmprior.training import precondition
 
 BF16 = dataclasses.replace(CONFIG, precision="bf16")

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 
-from lab.demonstrations.tasks import navigation_task
+from lab.demonstrations.loading import navigation_task
 from tests.errors import raises, refuses
 from tests.rl.training_parts import make_actor, make_env, make_training
 from tests.toy_env import ACTION_DIM, CountingEnv, demonstrations

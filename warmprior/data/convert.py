@@ -17,6 +17,7 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from warmprior.checks import check_choice
+from warmprior.data.checks import DatasetError, declared_poses
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations
 from warmprior.data.formats.lerobot_index import (
     DESCRIPTION,
@@ -26,7 +27,7 @@ from warmprior.data.formats.lerobot_index import (
     layout_of,
     state_names,
 )
-from warmprior.data.index import DatasetError, DatasetIndex, declared_poses
+from warmprior.data.index import DatasetIndex
 from warmprior.data.steps import solved
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic

@@ -12,8 +12,9 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from warmprior.checks import check_between, check_choice, check_whole_numbers, given
+from warmprior.data.checks import DatasetError
 from warmprior.data.image_cache import cached_images
-from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
+from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.data.steps import Storage, StoredActions, read_steps
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION

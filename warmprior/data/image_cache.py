@@ -18,7 +18,8 @@ from filelock import FileLock
 from tensordict import MemoryMappedTensor
 from torch import Tensor
 
-from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader
+from warmprior.data.checks import DatasetError
+from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.io.files import cache_folder, digest_of, reserve, storing, write_atomic
 from warmprior.io.progress import progress_bar
 from warmprior.modules.resize import resized

@@ -9,8 +9,9 @@ from importlib.metadata import version
 
 import numpy as np
 
+from warmprior.data.checks import DatasetError, store_finite
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.index import DatasetError, DatasetIndex, store_finite
+from warmprior.data.index import DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer
 from warmprior.envs.simulator import make_simulator, scene_stays

@@ -12,8 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_keys
+from warmprior.data.checks import check_kept
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.index import BLOCK, DatasetIndex, check_kept
+from warmprior.data.index import BLOCK, DatasetIndex
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE
 from warmprior.modules.resize import resized
 from warmprior.options.data import Resize

@@ -14,16 +14,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_choice
+from warmprior.data.checks import MISFIT, DatasetError, declared_poses, reading
 from warmprior.data.image_cache import image_shape, read_images
-from warmprior.data.index import (
-    BLOCK,
-    MISFIT,
-    DatasetError,
-    DatasetIndex,
-    DemonstrationReader,
-    declared_poses,
-    reading,
-)
+from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
 from warmprior.io.machine import available_memory

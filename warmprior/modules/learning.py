@@ -11,7 +11,7 @@ from torch.optim import AdamW
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.modules.schedule import warmup_cosine
+from warmprior.modules.learning_rate import warmup_cosine
 
 
 def widths_of(windows: ReplayBuffer, reader: object) -> list[int]:

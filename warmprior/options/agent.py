@@ -16,6 +16,12 @@ from warmprior.checks import (
 
 Algorithm = Literal["dsrl-na", "dsrl-sac"]
 
+WARM_DELTA, ZERO_DELTA = 0.5, 1.5
+"""Half the side of an agent's box around the mean of a warm source, and around zero (the paper's)."""
+
+NUM_ENVS = 4
+"""The number of simulators that an agent learns from at once."""
+
 
 @dataclass(frozen=True)
 class PriorSpaceConfig:

@@ -17,17 +17,17 @@ from warmprior import keys
 from warmprior.checks import check_finite
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import compiling
-from warmprior.options.agent import PriorSpaceConfig
+from warmprior.options.agent import WARM_DELTA, ZERO_DELTA, PriorSpaceConfig
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import PriorDecoder, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
-from warmprior.saving.checkpoint import named, restore_optimizer, select, snapshot_optimizer
+from warmprior.saving.training_state import named, restore_optimizer, select, snapshot_optimizer
 
 
 def delta_of(config: PriorSpaceConfig, actor: WarmPriorActor) -> float:
-    """Return ``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
-    return config.delta or (0.5 if has_anchor(actor) else 1.5)
+    """Return ``delta``, or its default for a policy: around a mean, or around zero."""
+    return config.delta or (WARM_DELTA if has_anchor(actor) else ZERO_DELTA)
 
 
 class WarmUpSwitch(TensorDictModuleBase):

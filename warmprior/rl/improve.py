@@ -16,7 +16,7 @@ from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.options.agent import IMPROVE, PriorSpaceConfig
+from warmprior.options.agent import IMPROVE, NUM_ENVS, PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
@@ -59,7 +59,7 @@ def improve_policy(
     *,
     make_env: Callable[..., EnvBase] | None = None,
     make_transforms: Callable[[], Compose] | None = None,
-    num_envs: int = 4,
+    num_envs: int = NUM_ENVS,
     config: PriorSpaceConfig | None = None,
     episodes: int = 100,
     compile: bool = False,

@@ -19,7 +19,7 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.rl.anchor import check_source_space, has_anchor, held, source_anchor
 from warmprior.rl.networks import make_prior_space_actor
-from warmprior.saving.checkpoint import as_key
+from warmprior.saving.training_state import as_key
 
 _READ = (keys.ANCHOR, keys.ACTIONS)
 """What agents read beside the observation."""

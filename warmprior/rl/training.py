@@ -32,7 +32,7 @@ from warmprior.rl.agent import PriorSpaceAgent, WarmUpSwitch
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import residual_reach
 from warmprior.rl.improved import improved_policy
-from warmprior.saving.checkpoint import (
+from warmprior.saving.training_state import (
     RunState,
     as_key,
     digest_of_state,

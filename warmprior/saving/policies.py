@@ -30,7 +30,7 @@ from warmprior.modules.recording import Recording
 from warmprior.modules.registry import from_config
 from warmprior.modules.sampling import Sampling
 from warmprior.modules.trend import RestingAction
-from warmprior.saving.checkpoint import as_key, load_state, save_state
+from warmprior.saving.training_state import as_key, load_state, save_state
 
 FORMAT = 9
 """The version of the layout that :func:`save_policy` writes."""

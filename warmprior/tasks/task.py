@@ -26,7 +26,7 @@ from warmprior.modules.prior import GaussianPrior, Prior
 from warmprior.modules.recording import AS_RECORDED
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingPose
 from warmprior.options.data import Actions
-from warmprior.saving.checkpoint import data_digest
+from warmprior.saving.training_state import data_digest
 from warmprior.transforms.chunk import Measures, check_measures
 from warmprior.transforms.policy import PolicyEnv, policy_transforms
 

@@ -1,6 +1,6 @@
 """Behaviour cloning, and the options of its networks and recipes."""
 
-from warmprior.modules.schedule import warmup_cosine
+from warmprior.modules.learning_rate import warmup_cosine
 from warmprior.options.training import NetworkOptions, TrainingConfig
 from warmprior.training.cloning import BehaviourCloning
 from warmprior.training.networks import make_network

@@ -24,7 +24,8 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import device_of, uncompiled
 from warmprior.objectives.couplings import Coupling
 from warmprior.options.training import TrainingConfig
-from warmprior.saving.checkpoint import (
+from warmprior.saving.policies import check_saveable, load_policy, policy_config, save_policy
+from warmprior.saving.training_state import (
     RunState,
     differences,
     fixed_identity,
@@ -34,7 +35,6 @@ from warmprior.saving.checkpoint import (
     run_identity,
     select,
 )
-from warmprior.saving.policies import check_saveable, load_policy, policy_config, save_policy
 from warmprior.training.gradient_step import GradientStep
 from warmprior.training.placement import Prefetch
 from warmprior.transforms.window import window_replay_buffer

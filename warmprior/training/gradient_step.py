@@ -15,12 +15,12 @@ from warmprior import keys
 from warmprior.io.distributed import world_size
 from warmprior.io.workers import count_devices
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.learning_rate import warmup_cosine
 from warmprior.modules.network import compiling
-from warmprior.modules.schedule import warmup_cosine
 from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.options.training import TrainingConfig
-from warmprior.saving.checkpoint import (
+from warmprior.saving.training_state import (
     module_tensors,
     named,
     restore_module,

@@ -19,7 +19,8 @@ from warmprior.modules.actor import StartPoint
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.options.training import TrainingConfig
-from warmprior.saving.checkpoint import (
+from warmprior.saving.policies import NoLargerThan
+from warmprior.saving.training_state import (
     check_identity,
     load_state,
     module_tensors,
@@ -28,7 +29,6 @@ from warmprior.saving.checkpoint import (
     run_identity,
     save_state,
 )
-from warmprior.saving.policies import NoLargerThan
 from warmprior.transforms.window import window_replay_buffer, without_images
 
 SHARE = 0.25

@@ -72,8 +72,8 @@ def download_robomimic(
 
 def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
     """Download and check a file from the first repository that delivers it."""
+    from warmprior.data.checks import DatasetError
     from warmprior.data.formats.hdf5 import open_robomimic
-    from warmprior.data.index import DatasetError
 
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")

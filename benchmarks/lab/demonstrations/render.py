@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 from lab.io.workers import available_cores, working
 from warmprior.checks import check_distinct, check_whole_numbers, given
+from warmprior.data.checks import DatasetError
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
 from warmprior.data.image_check import StateRenderer, renderer_versions
-from warmprior.data.index import DatasetError, DatasetIndex
+from warmprior.data.index import DatasetIndex
 from warmprior.envs.rendering import require_rendering
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic

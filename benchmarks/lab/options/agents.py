@@ -11,7 +11,7 @@ import tyro
 
 from lab.demonstrations.data_options import check_counts
 from lab.options.options import FinishedRun, Options, check_given, check_single
-from warmprior.options.agent import Algorithm, PriorSpaceConfig
+from warmprior.options.agent import NUM_ENVS, Algorithm, PriorSpaceConfig
 
 if TYPE_CHECKING:
     from lab.methods.methods import Method
@@ -78,7 +78,7 @@ class AgentsOptions(Options):
     # for warm sources, centre of the search: the source's mean, zero as a control, or both
     centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
     delta: tuple[float, ...] = ()  # half widths of the agents' boxes (default: 0.5 around a mean, else 1.5)
-    num_envs: int = 4  # number of parallel environments per agent
+    num_envs: int = NUM_ENVS  # number of parallel environments per agent
     # number of Ray actors that collect, with --num-envs environments each; needs --engine ray (default: none)
     collectors: int | None = None
 

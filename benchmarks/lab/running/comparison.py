@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from lab.demonstrations.tasks import title_of
+from lab.demonstrations.loading import title_of
 from lab.io.errors import PartialFailure
 from lab.io.leader import go_on_alone
 from lab.methods.methods import Method

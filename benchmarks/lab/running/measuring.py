@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from lab.demonstrations.loading import place_of, read_like
 from lab.demonstrations.scripted.generate import generate_demonstrations
-from lab.demonstrations.tasks import place_of, read_like
 from lab.measures.memory_gain import memory_gain
 from lab.measures.source_errors import mean_error, source_coverage
 from lab.measures.straightness import bounds

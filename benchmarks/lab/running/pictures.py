@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from lab.demonstrations.tasks import title_of
+from lab.demonstrations.loading import title_of
 from lab.options.options import Options
 from lab.reporting.plots import plot_filmstrip, plot_learning_curves, plot_success
 from lab.reporting.report import at_fewest, labelled, per_seed

@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 
 from lab.demonstrations.data_options import DataOptions, without_images
-from lab.demonstrations.tasks import load_task, longest_of, space_of, task_places, title_of
+from lab.demonstrations.loading import load_task, longest_of, space_of, task_places, title_of
 from lab.measures.source_errors import mean_revision
 from lab.methods.methods import Method, code_digest
 from lab.options.options import Evaluation, Options, Run, with_parts
@@ -35,7 +35,7 @@ from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.saving import load_policy
-from warmprior.saving.checkpoint import load_state, run_identity
+from warmprior.saving.training_state import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path

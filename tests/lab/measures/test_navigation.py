@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lab.demonstrations.tasks import navigation_task
+from lab.demonstrations.loading import navigation_task
 from lab.measures.navigation import judge_navigation, play_navigation
 from lab.methods.methods import PointPrior
 from warmprior import GaussianPrior, PastPrior, PreviewPrior

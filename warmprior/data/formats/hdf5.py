@@ -19,21 +19,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warmprior.data import index as indices
-from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.heaps import open_checked
-from warmprior.data.index import (
-    BLOCK,
+from warmprior.data import checks
+from warmprior.data.checks import (
     DatasetError,
-    DatasetIndex,
-    DemonstrationReader,
     check_count,
     check_env_args,
     declared_poses,
-    pose_keys,
     store_finite,
     unknown_name_error,
 )
+from warmprior.data.demonstrations import Demonstrations
+from warmprior.data.formats.heaps import open_checked
+from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader, pose_keys
 from warmprior.envs.robosuite_tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
@@ -52,7 +49,7 @@ _OBSERVE = "use the low_dim file, or replay its states (python -m warmprior obse
 
 def reading(parent: h5py.Group, name: str) -> AbstractContextManager[None]:
     """Turn any error inside into a DatasetError that names the file and the object below ``parent``."""
-    return indices.reading(_place(parent, name), _AGAIN)
+    return checks.reading(_place(parent, name), _AGAIN)
 
 
 def names(group: h5py.Group) -> list[str]:
@@ -249,7 +246,7 @@ def read_described(file: h5py.File, name: str) -> Any:
 def _check_count(group: h5py.Group, name: str, steps: int) -> None:
     """Compare steps with a group's own count, if there is one: damage can hide demos, and rows be padding."""
     what = f"{_place(group)}.attrs[{name!r}]"
-    with indices.reading(what, _AGAIN):
+    with checks.reading(what, _AGAIN):
         count = group.attrs.get(name)
         differs = count is not None and int(np.asarray(count).item()) != steps
     if differs:

@@ -12,9 +12,10 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from warmprior.data.checks import DatasetError, check_count
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader, open_robomimic
-from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader, check_count
+from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.data.steps import StoredActions, are_poses
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest

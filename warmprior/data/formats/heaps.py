@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, override
 
-from warmprior.data.index import DatasetError
+from warmprior.data.checks import DatasetError
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from warmprior.checks import check_shape
+from warmprior.data.checks import DatasetError, reading, store_finite
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.formats.lerobot_index import (
     REWARD,
@@ -25,7 +26,7 @@ from warmprior.data.formats.lerobot_index import (
     is_remote,
     read_lerobot_index,
 )
-from warmprior.data.index import DatasetError, DatasetIndex, DemonstrationReader, reading, store_finite
+from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.envs.robosuite_tasks import TASKS
 from warmprior.envs.simulator import task_env_args
 from warmprior.io.extras import require

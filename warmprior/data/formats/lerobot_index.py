@@ -10,16 +10,15 @@ from itertools import accumulate, pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
-from warmprior.data.index import (
+from warmprior.data.checks import (
     DatasetError,
-    DatasetIndex,
     check_count,
     check_env_args,
     declared_poses,
-    pose_keys,
     reading,
     unknown_name_error,
 )
+from warmprior.data.index import DatasetIndex, pose_keys
 from warmprior.envs.robosuite_tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import check_regular, digest_of, file_digest, is_repository, read_json

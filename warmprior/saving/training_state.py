@@ -124,7 +124,7 @@ def differences(before: Any, now: Any) -> str:
     """Return in words what differs between two configurations of JSON.
 
     Examples:
-        >>> from warmprior.saving.checkpoint import differences
+        >>> from warmprior.saving.training_state import differences
         >>> before = {"prior": {"name": "past", "sigma": 0.5}, "data": "fd6a7b7812d94c3f"}
         >>> differences(before, {"prior": {"name": "past", "sigma": 0.3}, "data": "4b6c497c00a1b2c3"})
         'sigma was 0.5 and is 0.3; the demonstrations, or what is read of them, differ'

@@ -142,7 +142,7 @@ def navigation_task(style: Literal["toy", "position"] = "toy") -> Task:
     In the style ``"position"`` policies see the position alone, as in the paper.
 
     Examples:
-        >>> from lab.demonstrations.tasks import navigation_task
+        >>> from lab.demonstrations.loading import navigation_task
         >>> task = navigation_task()
         >>> task.name, task.make_env(batch_size=[8]).batch_size
         ('navigation', torch.Size([8]))
@@ -169,7 +169,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph") -> Task
 
     Examples:
         >>> from lab.demonstrations.data_options import DataOptions
-        >>> from lab.demonstrations.tasks import load_task
+        >>> from lab.demonstrations.loading import load_task
         >>> load_task(DataOptions(), "navigation").style
         'toy'
     """
