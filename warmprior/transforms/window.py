@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -320,11 +321,11 @@ class _WindowStorage(TensorStorage):
 
     def get(self, index: Any) -> TensorDictBase:
         """Return the windows of some steps."""
-        drawn = isinstance(index, Tensor) and index.dtype == torch.int64
-        if drawn and index.device == self.frames.device:
-            frame = self.frames.take(index)  # as below, without a tenth of a sample's time
-        else:
-            frame = self.frames[index]
+        numbers = isinstance(index, Tensor) and index.dtype == torch.int64 and index.ndim == 1
+        if numbers and index.is_cpu and self.frames.is_cpu:
+            with suppress(IndexError):  # of a number that is negative, or outside
+                return self.window._windows(index)  # as below, without a twentieth of a sample's time
+        frame = self.frames[index]
         if frame.ndim == 1:
             return self.window._windows(frame)
         return self.window._windows(frame.reshape(-1)).reshape(frame.shape)
