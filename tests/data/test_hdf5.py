@@ -75,6 +75,25 @@ def test_a_file_of_another_simulator_is_read_without_its_environment(tmp_path):
     assert RobomimicDemonstrations(path).index().env_args == {}
 
 
+def test_a_file_without_an_environment_names_its_rate(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path)
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["control_freq"] = 30  # the environment's own counts
+    assert RobomimicDemonstrations(path).index().rate == 20
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["env_args"]
+    assert RobomimicDemonstrations(path).index().rate == 30
+    for value in (0, -30.0, np.nan, "fast"):
+        with h5py.File(path, "a") as file:
+            file["data"].attrs["control_freq"] = value
+        with raises(ValueError, path, "control_freq" if value == "fast" else "control steps per second"):
+            RobomimicDemonstrations(path).index()
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["control_freq"]
+    assert RobomimicDemonstrations(path).index().rate is None
+
+
 def test_files_without_rewards(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -107,11 +108,21 @@ def other_rate(file):
     file["data"].attrs["env_args"] = text.replace('"control_freq": 20', '"control_freq": 10')
 
 
+def other_rate_without_environment(file):
+    for path in Path(file.filename).parent.glob("*.hdf5"):
+        if path.name == "monday.hdf5":
+            with h5py.File(path, "a") as other:
+                del other["data"].attrs["env_args"]
+    del file["data"].attrs["env_args"]
+    file["data"].attrs["control_freq"] = 10
+
+
 @pytest.mark.parametrize(
     ("change", "facts"),
     [
         (without("rewards"), ["rewards", "False"]),
         (other_rate, ["env_args", "monday.hdf5"]),
+        (other_rate_without_environment, ["rate", "10.0", "None"]),
         (wider("obs/agentview_image"), ["image_shapes", "(10, 10)", "(8, 8)"]),
         (without("obs/object"), ["'object'"]),
     ],

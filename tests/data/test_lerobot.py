@@ -72,9 +72,33 @@ def test_images_are_decoded_as_lerobot_does(written):
     assert off.abs().mean() < 8  # a video is lossy
 
 
+def test_a_decoder_is_looked_for_once_per_reader(written, monkeypatch):
+    """LeRobot prints a page of tracebacks each time that it finds none of its first choice."""
+    root, _ = written
+    looked: list[str] = []
+    for module in ("utils.import_utils", "datasets.video_utils"):
+        name = f"lerobot.{module}.get_safe_default_video_backend"
+        monkeypatch.setattr(name, lambda: looked.append("") or "pyav")
+    monkeypatch.setattr("warmprior.data.formats.lerobot.DECODED", 3 * 32 * 32)  # a frame at once
+    demonstrations = LeRobotDemonstrations(root)
+    index = demonstrations.index(images=["robot0_eye_in_hand_image"])
+    with demonstrations.reader(index) as reader:
+        frames = [len(part) for demo in index.demos for part in reader.images(demo, index.image_keys[0])]
+    assert sum(frames) == 16 and len(frames) > len(index.demos)
+    assert len(looked) == 1
+
+
 def test_images_of_another_decoder_are_decoded_anew(written, tmp_path, monkeypatch):
     """A video's decoder follows from what can be loaded, not only from versions; pictures have another."""
+    from lerobot.datasets import video_utils
+
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
+    decode = video_utils.decode_video_frames
+
+    def with_pyav(path, times, tolerance, backend, **options):
+        return decode(path, times, tolerance, "pyav", **options)  # the other may be missing here
+
+    monkeypatch.setattr(video_utils, "decode_video_frames", with_pyav)
     root, _ = written
     keys = ["agentview_image", "robot0_eye_in_hand_image"]
     for backend, files in (("pyav", 2), ("torchcodec", 3), ("pyav", 3)):

@@ -193,6 +193,21 @@ META = {
 VALUES = {
     "cut off": (cut(DATA), ["damaged", "finalize()"]),
     "NaN": (table(DATA, action=entry(8, float("nan"))), ["action", "episode 2", "nan", "row 1"]),
+    "NaN among observations": (
+        table(DATA, observation__state=entry(8, float("nan"))),
+        ["observation.state", "episode 2", "nan", "row 1", "lerobot-edit-dataset"],
+    ),
+    "a time stamp among observations": (
+        table(DATA, observation__state=entry(8, 1.7e9)),
+        ["observation.state", "episode 2", "1.7e+09", "row 1", "offset"],
+    ),
+    **{
+        f"time stamps of {rate:g} steps per second": (
+            table(DATA, timestamp=lambda times, rate=rate: [time * 20 / rate for time in times]),
+            ["episode 0", "fps", 20, f"{1 / rate:.4g} s", "0.05 s"],
+        )
+        for rate in (15.0, 19.0, 25.0, 30.0)
+    },
     "dropped frames": (
         table(DATA, timestamp=entry(slice(12, 16), [1.0] * 4, None)),
         ["episode 2", "row 5", 20],

@@ -87,10 +87,12 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, advice: str, fir
     usable = np.abs(out) <= LARGEST  # False for NaN
     if not usable.all():
         value, row = out[~usable][0], first + int(np.argmin(usable.all(-1)))
-        raise DatasetError(
-            f"{what} has {value:g} in row {row}, expected numbers up to {LARGEST:g} (of time stamps, those "
-            f"since the first). {advice}"
-        )
+        if np.isfinite(value):
+            advice = (
+                f"Numbers are at most {LARGEST:g}: subtract an offset (of a time stamp the first), or choose "
+                "observations without it."
+            )
+        raise DatasetError(f"{what} has {value:g} in row {row}. {advice}")
     check_kept(block.reshape(out.shape), out, what)
 
 

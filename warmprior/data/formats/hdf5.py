@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 
 CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, even to read a few rows
+RATE = "control_freq"
+"""The attribute of ``data`` with the control steps per second, for files that describe no environment."""
+
 _MAX_SOFT_LINKS = 16
 _AGAIN = "Copy or download it again."
 _COPY = "Other files are not read: copy the data into this file."
@@ -243,16 +246,20 @@ def read_described(file: h5py.File, name: str) -> Any:
         return json.loads(attributes[name]) if name in attributes else None
 
 
+def _number(group: h5py.Group, name: str) -> float | None:
+    """Return a number among a group's attributes, or ``None`` if there is none."""
+    with checks.reading(f"{_place(group)}.attrs[{name!r}]", _AGAIN):
+        value = group.attrs.get(name)
+        return None if value is None else float(np.asarray(value).item())
+
+
 def _check_count(group: h5py.Group, name: str, steps: int) -> None:
     """Compare steps with a group's own count, if there is one: damage can hide demos, and rows be padding."""
-    what = f"{_place(group)}.attrs[{name!r}]"
-    with checks.reading(what, _AGAIN):
-        count = group.attrs.get(name)
-        differs = count is not None and int(np.asarray(count).item()) != steps
-    if differs:
+    count = _number(group, name)
+    if count is not None and count != steps:
         raise DatasetError(
-            f"{what} counts {count} steps, but there are {steps}: a demo is missing, incomplete or padded. "
-            "Copy or download it again, or correct the attribute."
+            f"{_place(group)}.attrs[{name!r}] counts {count:g} steps, but there are {steps}: a demo is "
+            "missing, incomplete or padded. Copy or download it again, or correct the attribute."
         )
 
 
@@ -465,6 +472,7 @@ class RobomimicDemonstrations(Demonstrations):
             taken_by = dict.fromkeys(present - common, "") | _options(group, common - {*keys, *images})
             if self.mask is None and self.demos is None:
                 _check_count(file["data"], "total", sum(lengths))
+            rate = env_args["env_kwargs"].get("control_freq", 20) if env_args else _number(file["data"], RATE)
         return DatasetIndex(
             path=path,
             demos=selected,
@@ -479,7 +487,7 @@ class RobomimicDemonstrations(Demonstrations):
             env_args=env_args,
             task=task,
             whole=len(selected) == count,
-            rate=env_args["env_kwargs"].get("control_freq", 20) if env_args else None,
+            rate=rate,
         )
 
     @contextmanager

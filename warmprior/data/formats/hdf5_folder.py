@@ -21,7 +21,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
 from warmprior.modules.recording import Recording
 
-EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards")
+EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards", "rate")
 """All files of a folder agree in these entries of their indices."""
 
 ENDINGS = (".hdf5", ".h5")

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from math import prod
 from pathlib import Path
 from typing import Any, override
@@ -34,11 +35,12 @@ from warmprior.io.files import check_regular
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
+OTHER_RATE = 0.02  # the share by which a rate differs from another
 _AGAIN = (
     "It is damaged, or from another dataset. Copy, download, record or convert it again; recordings end with "
     "LeRobotDataset.finalize()."
 )
-_REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
+_REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or choose others with episodes=."
 
 
 class LeRobotReader(DemonstrationReader):
@@ -90,14 +92,14 @@ class LeRobotReader(DemonstrationReader):
         """Raise DatasetError if time stamps ``[rows]`` do not fit the rate, or leap."""
         fps, exact = self.index.metadata.fps, times.astype(np.float64)
         steps = np.diff(exact) * fps
-        # Time stamps in float32 are coarse after hours.
-        if (even := abs(steps - 1) <= 0.5 + fps * np.spacing(abs(times).max(initial=0))).all():
-            return
-        if not abs(np.median(steps) - 1) <= 0.5:
+        coarse = fps * np.spacing(abs(times).max(initial=0))  # time stamps in float32 are, after hours
+        if len(steps) and not abs(np.median(steps) - 1) <= OTHER_RATE + coarse:
             raise DatasetError(
-                f"{what} has time stamps {np.median(steps) / fps:g} s apart, but fps is {fps}: correct "
-                f"either. {_REBUILD}"
+                f"{what} has time stamps {np.median(steps) / fps:.4g} s apart, but fps in meta/info.json is "
+                f"{fps:g}, steps of {1 / fps:.4g} s: correct fps, or resample the dataset"
             )
+        if (even := abs(steps - 1) <= 0.5 + coarse).all():
+            return
         row = int(even.argmin())
         raise DatasetError(
             f"{what} leaps from {exact[row]:.9g} to {exact[row + 1]:.9g} s at row {row + 1}, at {fps} fps. "
@@ -150,8 +152,12 @@ class LeRobotReader(DemonstrationReader):
     def decoders(self, key: str) -> Sequence[str]:
         if self.index.images[key] not in self.index.videos:
             return ("pillow",)
-        backend = require("lerobot.utils.import_utils", "lerobot").get_safe_default_video_backend()
-        return "lerobot", {"pyav": "av"}.get(backend, backend)
+        return "lerobot", {"pyav": "av"}.get(self._backend, self._backend)
+
+    @cached_property
+    def _backend(self) -> str:
+        """LeRobot's default decoder; LeRobot prints a traceback each time that it looks for one in vain."""
+        return str(require("lerobot.utils.import_utils", "lerobot").get_safe_default_video_backend())
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
         av, video = (require(name, "lerobot") for name in ("av", "lerobot.datasets.video_utils"))
@@ -165,7 +171,7 @@ class LeRobotReader(DemonstrationReader):
         def frames(first: int, stop: int) -> Tensor:
             wanted = times[first:stop].tolist()
             try:
-                return video.decode_video_frames(path, wanted, TOLERANCE, return_uint8=True)
+                return video.decode_video_frames(path, wanted, TOLERANCE, self._backend, return_uint8=True)
             # No frame is near a time; torchcodec's error where the video ends before.
             except (video.FrameTimestampError, IndexError) as error:
                 raise DatasetError(

@@ -61,8 +61,9 @@ def download_lerobot(
         )
     except Exception as error:  # the client's errors share no base class
         raise OSError(
-            f"could not download {repository} at {revision} ({error!r}): check name and connection; older "
-            "datasets lack this revision until python -m lerobot.scripts.convert_dataset_v21_to_v30"
+            f"there is no folder {repository}, and it could not be downloaded at {revision} ({error!r}): "
+            "check name and connection; older datasets lack this revision until python -m "
+            "lerobot.scripts.convert_dataset_v21_to_v30"
         ) from error
     return Path(folder)
 
@@ -224,7 +225,10 @@ def _check_frames(root: Path, metadata: Any, video: str, chosen: Set[int]) -> No
         for *file, start, length, number in sorted(zip(*columns, strict=True)):
             before, end, other = last
             if file == before and start < end and not chosen.isdisjoint((number, other)):
-                raise ValueError(f"the frames of the episodes {other} and {number} overlap in {video}")
+                raise ValueError(
+                    f"the frames of the episodes {other} and {number} overlap in {video} at "
+                    f"{metadata.fps:g} fps, the rate of meta/info.json"
+                )
             # A video may lack its last frame.
             ends = start + max(length - 1.5, 0.5) / metadata.fps
             if file != before or ends > end:
