@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and 
     from tensordict import TensorDictBase
 
     from warmprior.modules.actor import WarmPriorActor
+    from warmprior.modules.trend import RestingAction
 
 Imported = tyro.conf.UseAppendAction[
     Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE")]
@@ -375,14 +376,16 @@ def train(
     saved = policy_path(run.out / name, training.iterations)
     nfes = (1, 3, 9) if sampling.max_nfe is None else (1,)
     if left_out is not None:
-        spread = float(left_out["action"].var(0, correction=0).mean())
         number = count - task.facts["demonstrations"]
         print(
-            f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}); "
-            f"the mean action has {spread:.4f}:"
+            f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}, "
+            f"{len(left_out):,} steps):"
         )
-        for n, error in errors_of(actor, left_out, (*nfes, sampling.evaluations())).items():
-            print(f"  NFE {n}: {error:.4f}")
+        errors, others = errors_of(actor, left_out, (*nfes, sampling.evaluations()), task.rest)
+        for name, error in {**{f"NFE {n}": error for n, error in errors.items()}, **others}.items():
+            print(f"  {name}: {error:.4f}")
+        if min(errors.values()) >= (least := min(others.values())):
+            print(f"no error is below {least:.4f}: train for longer (--iterations), or check the data")
     elif whole.environment is None:
         print("no demonstration is held out, so no error is measured")
     if playable:
@@ -395,20 +398,32 @@ def train(
 train.__doc__ = str(train.__doc__).format(PLACES=PLACES)
 
 
-def errors_of(actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int]) -> dict[int, float]:
-    """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE."""
+def errors_of(
+    actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int], rest: RestingAction | None
+) -> tuple[dict[int, float], dict[str, float]]:
+    """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE.
+
+    And those of actions that know nothing: their mean, and with a resting action staying where the robot is.
+    """
     import torch
     from tensordict import TensorDict
 
     from warmprior.diagnostics import action_error, encoded_windows
-    from warmprior.keys import FRAME
+    from warmprior.keys import CHUNK, FRAME, IS_PAD, OBSERVATION
+    from warmprior.modules.trend import vector_of
     from warmprior.transforms.window import window_transforms
 
     network: Any = actor.network
     windows = window_transforms(data, actor.prior, observation_steps=network.observation_steps)
     frames = torch.linspace(0, len(data) - 1, min(len(data), 4096)).round().long()
-    batch = encoded_windows(actor, windows(TensorDict({FRAME: frames}, [len(frames)])))
-    return action_error(actor, batch, nfes=nfes)
+    batch = windows(TensorDict({FRAME: frames}, [len(frames)]))
+    known = {"always the mean action": data["action"].mean(0)}
+    if rest is not None:
+        known["staying where the robot is"] = rest(vector_of(batch[OBSERVATION])[:, -1]).unsqueeze(1)
+    executed = slice(None, actor.prior.chunk_length)
+    target, inside = batch[CHUNK][:, executed], ~batch[IS_PAD][:, executed]
+    others = {name: float((target - action).square()[inside].mean()) for name, action in known.items()}
+    return action_error(actor, encoded_windows(actor, batch), nfes=nfes), others
 
 
 def export(

@@ -58,13 +58,20 @@ def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("count", "line"), [("1", "no demonstration is held out"), ("2", "demonstrations (1)")]
+    ("count", "line"), [("1", "no demonstration is held out"), ("2", "demonstrations (1, ")]
 )
 def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
     path = robot_file(tmp_path / "arm.hdf5")
     words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --demonstrations {count}"
     assert main(words.split()) == 0
     assert line in capsys.readouterr().out
+
+
+def test_unknown_joints_are_named_before_images_are_read(tmp_path, monkeypatch):
+    demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"))
+    monkeypatch.setattr("warmprior.data.image_cache.read_images", lambda *_: pytest.fail("was read"))
+    with raises(ValueError, "joints", "'arm'"):
+        Task(demonstrations, images=["wrist"], joints="arm")
 
 
 def test_an_image_that_is_not_there_is_named_beside_those_that_are(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
 
@@ -191,14 +191,14 @@ class Task:
                 f"{demonstrations}: {', '.join(unused)} would change a recorded environment, but {known}: "
                 "leave out what cannot be applied"
             )
-        steps = demonstrations.steps(
-            index.observation_keys,
-            index.image_keys,
-            actions=actions,
-            storage="memmap" if index.image_keys else "memory",
-        )
+        read = partial(demonstrations.steps, index.observation_keys, actions=actions)
+        steps = read()
         if observations is None:
             demonstrations.check_targets(index, steps, joints)  # who names the joints wants them
+        targets = index.joints if joints is None else joints
+        columns = index.joint_columns(targets) if isinstance(targets, str) and targets else [*targets]
+        if index.image_keys:  # what takes long comes last
+            steps = read(index.image_keys, storage="memmap")
         vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
         self.resize = index.resize
         self.name = demonstrations.title if recorded is None else recorded.name
@@ -227,13 +227,11 @@ class Task:
             self.facts |= recorded.facts
             if recorded.poses is not None:
                 self.rest = RestingPose(recorded.poses, self.normalizer)
-        targets = index.joints if joints is None else joints
-        if len(targets):
-            columns = index.joint_columns(targets) if isinstance(targets, str) else [*targets]
+        if columns:
             self.rest = self._joints(columns, needed=joints is not None)
         words = AS_RECORDED if self.environment is None else ", as the recorded environment takes them"
         if self.rest is not None:
-            words = f", absolute targets of {targets}" if len(targets) else ", absolute poses"
+            words = f", absolute targets of {targets}" if columns else ", absolute poses"
         self.recording = demonstrations.recording(index, f"[{self.data[ACTION].shape[-1]}]{words}")
 
     def _joints(self, columns: list[int], needed: bool) -> RestingJoints | None:
