@@ -73,11 +73,14 @@ def info(folder: Policy, /, *, revision: str | None = None, modules: Imported = 
     networks = [type(part).__name__ for part in actor.network.modules() if isinstance(part, VelocityNetwork)]
     named = {} if recording is None else recording.numbers
     numbers = "; ".join(f"{name}: {', '.join(names)}" for name, names in named.items())
+    spans = {} if recording is None else recording.ranges
+    ranges = "; ".join(f"{name}: from {low:.4g} to {high:.4g}" for name, (low, high) in spans.items())
     file = policy_file(folder, revision=revision)
     for name, value in {
         "takes": "unknown" if shapes is None else ", ".join(map(_wanted, shapes, shapes.values())),
         **({"observations": "names not kept"} if recording is None else recording.lines("--{}")),
         **({"numbers": numbers} if numbers else {}),
+        **({"ranges": ranges} if ranges else {}),
         "source": actor.prior,
         "start": actor.start or "the source",
         "NFE": f"{sampling.evaluations()}, {sampling.solver}, {sampling.grid} grid",

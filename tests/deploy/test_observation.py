@@ -1,12 +1,14 @@
 """Observations of drivers reach the policy in the form of its training, or are refused by name."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.deploy.test_executor import OBSERVATION_DIM, Scripted, actor
-from tests.errors import raises, refuses
+from tests.errors import missing, raises, refuses
 from tests.toy_env import ACTION_DIM, stirred
 from warmprior import (
     HistoryObservation,
@@ -20,6 +22,7 @@ from warmprior import (
 )
 from warmprior.deploy import AsyncExecutor
 from warmprior.deploy.observation import observation_shapes
+from warmprior.modules.recording import Recording
 
 CAMERAS = ("front_image", "wrist_image")
 
@@ -161,3 +164,86 @@ def test_drivers_reuse_their_memory():
             memory[:] = tick
             executor.act(memory)
     assert policy.given[-1]["observation"].flatten().tolist() == [1.0, 2.0]
+
+
+JOINTS = ("pan", "lift", "grip")
+
+
+def described(shape=(480, 640), normalizer=True, low=(-100.0, 20.0, 7.0), high=(100.0, 60.0, 7.0)):
+    """A policy of a camera, and of three joints whose last never moved, that knows the dataset's names."""
+    torch.manual_seed(0)
+    encoder = ImageEncoder(["front_image"], 3, image_size=16, crop_size=12, backbone="small")
+    network = VisionNetwork(encoder, VelocityMLP(ACTION_DIM, encoder.observation_dim, 6, hidden_dim=16))
+    key, ones = ("observation", "state"), torch.ones(ACTION_DIM)
+    ends = ({key: torch.tensor(end), "action": ones} for end in (low, high))
+    recording = Recording(
+        *("arm", 2, 60, "[2], as recorded", {"observation.state": 2, "effort": 1}),
+        names={"front_image": "observation.images.front"},
+        numbers={"observation.state": JOINTS[:2]},
+        sizes={"front_image": shape},
+    )
+    normalizer = Normalizer(*ends) if normalizer else None
+    return WarmPriorActor(network, PastPrior(6), normalizer=normalizer, recording=recording)
+
+
+def seen_at(state, height=480, width=640):
+    return {"state": np.array(state), "front_image": np.zeros((height, width, 3), np.uint8)}
+
+
+@pytest.mark.parametrize("normalizer", [True, False])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_none_is_named_as_the_dataset_does(value, normalizer):
+    usual = seen_at([0.0, 40.0, 7.0])
+    with AsyncExecutor(described(normalizer=normalizer), latency=0) as executor:
+        with raises(ValueError, "observation.state lift", "effort [0]") as refused:
+            executor.act(seen_at([0.0, value, value]))
+        assert missing(str(refused.value), "pan") == ["pan"]
+        parts = {"observation.state": [value, 40.0], "effort": [7.0], "front_image": usual["front_image"]}
+        refuses(lambda: executor.act(parts), ValueError, "observation.state pan")
+        assert executor.act(usual).isfinite().all()
+    with AsyncExecutor(actor(PastPrior(6)), latency=0) as executor, raises(ValueError, "state [1]"):
+        executor.act(torch.tensor([0.0, value, *[0.0] * (OBSERVATION_DIM - 2)]))
+
+
+def said_of(executor, *observations):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for observation in observations:
+            executor.act(observation)
+    assert all(warning.filename == __file__ for warning in caught)
+    return [str(warning.message) for warning in caught]
+
+
+def test_one_is_warned_once_of_numbers_far_from_the_demonstrations():
+    """Half their range beyond an end: lift from 0 to 80, whose demonstrations are from 20 to 60."""
+    with AsyncExecutor(described(), latency=0) as executor:
+        near = [seen_at(state) for state in ([-199.0, 1.0, 7.0], [199.0, 79.0, 7.0], [0.0, 40.0, 999.0])]
+        assert not said_of(executor, *near)
+        (said,) = said_of(executor, seen_at([210.0, 4000.0, 7.0]), seen_at([0.0, -4000.0, 7.0]))
+        assert not missing(said, "observation.state lift", 4000, 20, 60)
+        executor.reset()
+        assert not said_of(executor, seen_at([0.0, 4000.0, 7.0]))
+    with AsyncExecutor(described(high=(100.0, 60.0, 11.0)), latency=0) as executor:
+        first, second = said_of(executor, seen_at([-300.0, 40.0, 17.0]))
+        assert not missing(first, "effort [0]", 17, 7, 11) and not missing(second, "pan", -300, -100, 100)
+    with AsyncExecutor(described(normalizer=False), latency=0) as executor:
+        assert not said_of(executor, seen_at([0.0, 4000.0, 7.0]))
+
+
+@pytest.mark.parametrize(
+    ("recorded", "size", "warned"),
+    [
+        ((480, 640), (240, 320), False),
+        ((480, 640), (479, 640), False),
+        ((480, 640), (480, 655), True),
+        ((480, 640), (720, 1280), True),
+        ((480, 640), (640, 480), True),
+        ((16, 16), (480, 640), False),  # whoever recorded them may have resized them
+    ],
+)
+def test_one_is_warned_once_of_pictures_of_another_ratio(recorded, size, warned):
+    with AsyncExecutor(described(recorded), latency=0) as executor:
+        said = said_of(executor, *[seen_at([0.0, 40.0, 7.0], *size)] * 3)
+    assert len(said) == warned
+    facts = "observation.images.front", "{} x {}".format(*size), "{} x {}".format(*recorded)
+    assert not missing(" ".join(said), *facts if warned else ())

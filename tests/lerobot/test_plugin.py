@@ -8,7 +8,7 @@ import torch
 from tests.errors import raises, refuses
 from tests.lerobot.plugin_policies import NEEDS_PLUGIN, VLA, flow_batch, flow_policy, small, warm
 from tests.lerobot.seen import watch
-from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
+from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, observations, windows
 
 pytestmark = NEEDS_PLUGIN
 
@@ -141,3 +141,17 @@ def test_another_number_of_environments(found, name):
     refuses(lambda: policy.select_action(dict(batches[2]), nfe=3), TypeError, "nfe")
     policy.reset()
     assert len(policy.select_action(dict(batches[3]))) == 3
+
+
+@pytest.mark.parametrize("name", VLA)
+def test_a_damaged_observation_is_refused(found, name):
+    policy = warm(found, name, n_action_steps=4).eval()
+    seen = observations(name.removeprefix("warm_"), 2)
+    state = "state" if name == "warm_groot" else "observation.state"
+    damage = {state: seen[state] * torch.nan}
+    if CAMERA in seen:
+        damage[CAMERA] = 255 * seen[CAMERA]
+    for act in (policy.select_action, policy.predict_action_chunk):
+        for entry, value in damage.items():
+            refuses(lambda act=act, change={entry: value}: act(seen | change), ValueError, entry)
+        assert act(seen).isfinite().all()

@@ -50,6 +50,35 @@ def test_an_observation_that_is_not_there_is_named(found):
             act(seen)
 
 
+def camera(value):
+    return {"observation.images.top": value}
+
+
+@pytest.mark.parametrize(
+    ("damage", "facts"),
+    [
+        ({"observation.state": torch.tensor([[0.0, 1.0, torch.nan]] * 2)}, ["NaN"]),
+        ({"observation.environment_state": torch.tensor([[torch.inf, 0.0]] * 2)}, ["infinity"]),
+        (camera(torch.full((2, 3, 16, 16), 255.0)), [255, "[0, 1]"]),
+        (camera(torch.full((2, 3, 16, 16), -1.0)), [-1, "[0, 1]"]),
+        (camera(torch.full((2, 3, 16, 16), torch.nan)), ["nan", "[0, 1]"]),
+        (camera(torch.full((2, 3, 16, 16), 9, dtype=torch.uint8)), ["uint8", "[0, 1]"]),
+    ],
+)
+def test_a_damaged_observation_is_refused_and_forgotten(found, damage, facts):
+    seen = one_observation() | camera(torch.rand(2, 3, 16, 16))
+    for name in ("select_action", "predict_action_chunk"):
+        actions = []
+        for damaged in (False, True):
+            policy = flow_policy(found, images=(3, 16, 16))
+            if damaged:
+                with raises(ValueError, *damage, *facts):
+                    getattr(policy, name)(seen | damage)
+            torch.manual_seed(0)
+            actions.append(getattr(policy, name)(seen))
+        assert torch.equal(*actions)
+
+
 def test_the_average_follows_the_weights(found):
     policy = flow_policy(found)
     before = [weight.clone() for weight in policy.actor.network.parameters()]
@@ -184,7 +213,11 @@ def test_the_executor_takes_the_names_and_the_rate_of_the_dataset(found, tmp_pat
     for observation in (ours, theirs):
         torch.manual_seed(0)
         with AsyncExecutor(actor, latency=0, control_rate=29.97) as executor:
-            actions.append(executor.act(observation))
+            with pytest.warns(UserWarning) as said:  # the demonstrations have squares
+                actions.append(executor.act(observation))
+            front, side = (str(warning.message) for warning in said)
+        for camera, text in {"front": front, "side": side}.items():
+            assert not missing(text, f"observation.images.{camera}", "48 x 64")
     assert torch.equal(*actions) and actions[0].std() > 0
     refuses(lambda: AsyncExecutor(actor, control_rate=50), ValueError, "control_rate=50", 30)
     config = json.loads((place / "config.json").read_text()) | {"recording": '{"rate": -1}'}

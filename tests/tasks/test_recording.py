@@ -256,7 +256,7 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     features = {name: numbers(width) for name, width in widths.items()}
     features["observation.state"]["names"] = JOINTS
     features["action"]["names"] = {"motors": JOINTS[::-1]}
-    write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
+    values = write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
     words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
     words += " --observations observation.state observation.effort --images observation.images.front"
     words += " --held-out 0"
@@ -270,6 +270,9 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     assert not missing(said["data"], "lerobot:arm", "2 demonstrations") and said["NFE"].startswith("3,")
     ordered = ", ".join(JOINTS), ", ".join(JOINTS[::-1])
     assert said["numbers"] == "observation.state: {}; action: {}".format(*ordered)
+    order = "observation.state", "observation.effort", "action"
+    ranges = [f"{name}: from {values[name].min():.4g} to {values[name].max():.4g}" for name in order]
+    assert said["ranges"].split("; ") == ranges
     assert "units of the demonstrations" in said["normaliser"]
 
     policy, rng = load_policy(folder), np.random.default_rng(0)

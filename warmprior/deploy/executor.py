@@ -56,8 +56,10 @@ class AsyncExecutor:
 
     The normaliser, the number of stacked observations, and the observations' names and sizes come from the
     policy. Camera images may have any size: they are resized as those of the training were, and the encoder
-    takes the central crop. Weights that are loaded into the policy are used from the next decision on, and
-    a normaliser's statistics from the next :meth:`reset` on.
+    takes the central crop. A warning, once each, names an image whose ratio of width to height is not the
+    recorded one, and an observation far outside of the range of the demonstrations. Weights that are loaded
+    into the policy are used from the next decision on, and a normaliser's statistics from the next
+    :meth:`reset` on.
 
     Args:
         actor: a :class:`~warmprior.WarmPriorActor`, an :class:`ExportedPolicy`, a
@@ -205,7 +207,8 @@ class AsyncExecutor:
 
         Raises:
             KeyError: if an entry is missing; the executor's state is then unchanged.
-            ValueError: if an entry has the wrong shape or is not an image; the state is then unchanged.
+            ValueError: if an entry has the wrong shape, holds NaN or infinity, or is not an image; the state
+                is then unchanged.
             TimeoutError: if no action is left, and the next chunk is not ready in time.
             RuntimeError: if the executor is closed.
             Exception: the policy's own error, once no action is left. Until then, and at every further call,

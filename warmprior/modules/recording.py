@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 
-from warmprior.checks import check_positive, check_whole_numbers, given
+from warmprior.checks import check_finite_numbers, check_positive, check_whole_numbers, given
 
 AS_RECORDED = ", as recorded"
 """The end of the words for actions whose meaning is unknown."""
@@ -40,6 +40,8 @@ class Recording:
         rate: control steps per second, if they are known.
         held_out: number of further demonstrations that are held out.
         numbers: the dataset's own names of the numbers of observations, and of ``"action"``, in their order.
+        ranges: the lowest and the highest number of each observation, and of ``"action"``, raw units.
+        sizes: height and width of each image as it is recorded.
 
     Raises:
         ValueError: if an entry has another form.
@@ -67,11 +69,17 @@ class Recording:
     rate: float | None = None
     held_out: int = 0
     numbers: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    ranges: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    sizes: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         counts = {"demonstrations": self.demonstrations, "steps": self.steps, "held_out": self.held_out}
         check_whole_numbers(0, **counts, **self.observations)
         check_positive(**given(rate=self.rate))
+        for low, high in self.ranges.values():
+            check_finite_numbers(low=low, high=high)
+        for height, width in self.sizes.values():
+            check_whole_numbers(height=height, width=width)
         texts = *self.images.values(), *self.names.values(), *chain(*self.left_out.values())
         texts = *texts, *chain(*self.numbers.values())
         if not all(isinstance(text, str) for text in (self.name, self.actions, *texts)):

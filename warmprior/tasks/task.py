@@ -232,7 +232,14 @@ class Task:
         words = AS_RECORDED if self.environment is None else ", as the recorded environment takes them"
         if self.rest is not None:
             words = f", absolute targets of {targets}" if columns else ", absolute poses"
-        self.recording = demonstrations.recording(index, f"[{self.data[ACTION].shape[-1]}]{words}")
+        observed = steps[vector].split(list(index.observation_dims), -1)
+        parts = {**dict(zip(index.observation_keys, observed, strict=True)), ACTION: steps[ACTION]}
+        ranges = {name: part.aminmax() for name, part in parts.items() if part.numel()}
+        self.recording = replace(
+            demonstrations.recording(index, f"[{self.data[ACTION].shape[-1]}]{words}"),
+            ranges={name: [float(end) for end in ends] for name, ends in ranges.items()},
+            sizes=dict(zip(index.image_keys, index.image_shapes, strict=True)),
+        )
 
     def _joints(self, columns: list[int], needed: bool) -> RestingJoints | None:
         """Return the resting action of joint targets, if actions are near the joints; else ``None``."""

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
+from lerobot_policy_warmprior.observed import check_observed
 from lerobot_policy_warmprior.used import check_used, recording_of
 from warmprior import (
     ChiTransformer,
@@ -368,6 +369,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
     def _remember(self, batch: dict[str, Tensor]) -> None:
         needed = *self.config.observed, *self._cameras
         check_keys(batch, needed, "the policy", "; its config.json names them in input_features")
+        check_observed(batch, self.config.observed, self._cameras)
         observations = {name: batch[name] for name in needed}
         self._memory.expect(len(batch[self.config.observed[0]]))
         self._queues = populate_queues(self._queues, observations)

@@ -6,15 +6,19 @@ import inspect
 from typing import Any
 
 import torch
+from lerobot.configs.types import NormalizationMode
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from torch import Tensor
 
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
+from lerobot_policy_warmprior.observed import check_observed
 from warmprior.checks import check_choice
 from warmprior.lerobot import WarmPriorAdapter, action_std
 from warmprior.lerobot.adapter import LEFT_OVER
+
+IDENTITY = NormalizationMode.IDENTITY
 
 REAL_TIME = ("inference_delay", LEFT_OVER, "execution_horizon")
 """Arguments that LeRobot's real-time chunking passes."""
@@ -60,6 +64,7 @@ class WarmPolicyMixin(WholePolicy):
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """Return the next action of every environment."""
         check_known("select_action", kwargs, ["noise"])
+        self._check_observed(batch)
         return self.warm_adapter.select_action(batch, super().select_action, **kwargs)  # type: ignore[misc]
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
@@ -75,8 +80,16 @@ class WarmPolicyMixin(WholePolicy):
                 "with --inference.rtc.enabled=false chunks are executed one after the other, however late, "
                 "so the executed actions are unknown: turn it on, or use --inference.type=sync"
             )
+        self._check_observed(batch)
         predict = super().predict_action_chunk  # type: ignore[misc]
         return self.warm_adapter.predict_action_chunk(batch, executed, predict, **kwargs)
+
+    def _check_observed(self, batch: dict[str, Any]) -> None:
+        config: Any = self.config
+        vectors = config.input_features.keys() - config.image_features.keys()
+        scaled = config.normalization_mapping.get("VISUAL", IDENTITY) != IDENTITY
+        # GR00T's processor packs images, and names the state otherwise.
+        check_observed(batch, [*vectors, "state"], () if scaled else config.image_features)
 
     def reset(self) -> None:
         """Start new episodes in all environments."""

@@ -91,7 +91,9 @@ def _flow_actor(policy: WarmFlowPolicy, preprocessor: Any) -> WarmPriorActor:
     recording = actor.recording
     if recording is not None:
         names = {name: feature for feature, name in entries.items() if feature in config.image_features}
-        recording = replace(recording, names=names)
+        kept = recording.sizes
+        sizes = {name: kept[feature] for name, feature in names.items() if feature in kept}
+        recording = replace(recording, names=names, sizes=sizes)
     return actor.replace(normalizer=normalizer, recording=recording)
 
 

@@ -48,4 +48,5 @@ def recording_of(config: WarmFlowConfig, dataset_meta: Any, episodes: Sequence[i
         left_out={taken_by: names for taken_by, names in left_out.items() if names},
         rate=dataset_meta.fps,
         numbers={name: names for name, names in numbers.items() if names},
+        sizes={name: entry.shape[1:] for name, entry in config.image_features.items()},
     )
