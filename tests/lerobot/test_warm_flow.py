@@ -151,7 +151,8 @@ def test_nan_of_an_episode_that_is_left_out_is_in_the_statistics(found, tmp_path
     stats = json.loads((root / "meta/stats.json").read_text())
     stats["action"]["max"][0] = float("nan")  # as LeRobot writes it
     (root / "meta/stats.json").write_text(json.dumps(stats))
-    with raises(ValueError, "meta/stats.json", "action: max", "delete_episodes", "recompute_stats"):
+    ways = "delete_episodes", "recompute_stats", "input_features"
+    with raises(ValueError, "meta/stats.json", "action: max", *ways):
         dataset_policy(found, root, [0])
 
 

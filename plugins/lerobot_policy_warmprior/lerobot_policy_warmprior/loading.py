@@ -85,9 +85,10 @@ def check_statistics(config: Any, meta: Any) -> None:
     if unusable:
         raise ValueError(
             f"{meta.root}/meta/stats.json has no usable {', '.join(unusable)}: LeRobot would train on raw "
-            "values, or on NaN, which any episode brings there. Delete such episodes (lerobot-edit-dataset "
-            "--operation.type=delete_episodes), compute it again (--operation.type=recompute_stats), or "
-            "change --policy.normalization_mapping"
+            f"values, on numbers above {LARGEST:g}, or on NaN, which any episode brings there. Delete such "
+            "episodes (lerobot-edit-dataset --operation.type=delete_episodes), compute it again "
+            "(--operation.type=recompute_stats), leave the feature out (--policy.input_features), or change "
+            "--policy.normalization_mapping"
         )
 
 
