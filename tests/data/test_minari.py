@@ -307,7 +307,7 @@ def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
     options = ["--observations", "arm", "--iterations", "2", "--hidden-dim", "8", "--held-out", "1"]
     assert not main(["train", place, "--out", str(tmp_path), "--nfe", "1", *options])
     said = capsys.readouterr().out
-    assert "(1)" in said and "NFE 1" in said and "NFE 9" in said
+    assert "(1, " in said and "NFE 1" in said and "NFE 9" in said
     task = Task(open_demonstrations(place))
     refuses(lambda: task.make_env(), ValueError, "environment")
 
