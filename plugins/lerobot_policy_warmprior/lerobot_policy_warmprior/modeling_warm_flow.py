@@ -19,9 +19,9 @@ from lerobot.processor import NormalizerProcessorStep, TransitionKey
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from lerobot_policy_warmprior.check_observed import check_observed
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
-from lerobot_policy_warmprior.observed import check_observed
 from lerobot_policy_warmprior.used import check_used, recording_of
 from warmprior import (
     ChiTransformer,

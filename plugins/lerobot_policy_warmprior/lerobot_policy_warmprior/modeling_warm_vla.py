@@ -11,9 +11,9 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from torch import Tensor
 
+from lerobot_policy_warmprior.check_observed import check_observed
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
 from lerobot_policy_warmprior.loading import WholePolicy, check_known, check_statistics
-from lerobot_policy_warmprior.observed import check_observed
 from warmprior.checks import check_choice
 from warmprior.lerobot import WarmPriorAdapter, action_std
 from warmprior.lerobot.adapter import LEFT_OVER
