@@ -26,6 +26,7 @@ from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
     from tensordict import TensorDictBase
+    from torch import Tensor
 
     from warmprior.modules.actor import WarmPriorActor
     from warmprior.modules.trend import RestingAction
@@ -384,7 +385,8 @@ def train(
             f"mean squared error of normalised actions (from -1 to 1) on held-out demonstrations ({number}, "
             f"{len(left_out):,} steps):"
         )
-        errors, others = errors_of(actor, left_out, (*nfes, sampling.evaluations()), task.rest)
+        mean = task.data["action"].mean(0)
+        errors, others = errors_of(actor, left_out, (*nfes, sampling.evaluations()), mean, task.rest)
         for name, error in {**{f"NFE {n}": error for n, error in errors.items()}, **others}.items():
             print(f"  {name}: {error:.4f}")
         if min(errors.values()) >= (least := min(others.values())):
@@ -402,11 +404,12 @@ train.__doc__ = str(train.__doc__).format(PLACES=PLACES)
 
 
 def errors_of(
-    actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int], rest: RestingAction | None
+    actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int], mean: Tensor, rest: RestingAction | None
 ) -> tuple[dict[int, float], dict[str, float]]:
     """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE.
 
-    And those of actions that know nothing: their mean, and with a resting action staying where the robot is.
+    And those of actions that need no policy: the training's ``mean`` ``[d_a]``, and with a resting action
+    staying where the robot is, with that mean where an action is no position target.
     """
     import torch
     from tensordict import TensorDict
@@ -420,9 +423,10 @@ def errors_of(
     windows = window_transforms(data, actor.prior, observation_steps=network.observation_steps)
     frames = torch.linspace(0, len(data) - 1, min(len(data), 4096)).round().long()
     batch = windows(TensorDict({FRAME: frames}, [len(frames)]))
-    known = {"always the mean action": data["action"].mean(0)}
+    known = {"always the mean action": mean}
     if rest is not None:
-        known["staying where the robot is"] = rest(vector_of(batch[OBSERVATION])[:, -1]).unsqueeze(1)
+        resting = torch.where(rest.is_target, rest(vector_of(batch[OBSERVATION])[:, -1]), mean)
+        known["staying where the robot is"] = resting.unsqueeze(1)
     executed = slice(None, actor.prior.chunk_length)
     target, inside = batch[CHUNK][:, executed], ~batch[IS_PAD][:, executed]
     others = {name: float((target - action).square()[inside].mean()) for name, action in known.items()}

@@ -113,6 +113,7 @@ def other_rate_without_environment(file):
         if path.name == "monday.hdf5":
             with h5py.File(path, "a") as other:
                 del other["data"].attrs["env_args"]
+                other["data"].attrs["control_freq"] = 20
     del file["data"].attrs["env_args"]
     file["data"].attrs["control_freq"] = 10
 
@@ -122,7 +123,7 @@ def other_rate_without_environment(file):
     [
         (without("rewards"), ["rewards", "False"]),
         (other_rate, ["env_args", "monday.hdf5"]),
-        (other_rate_without_environment, ["rate", "10.0", "None"]),
+        (other_rate_without_environment, ["control_freq", "10 ", " 20", "monday.hdf5"]),
         (wider("obs/agentview_image"), ["image_shapes", "(10, 10)", "(8, 8)"]),
         (without("obs/object"), ["'object'"]),
     ],
@@ -134,6 +135,16 @@ def test_the_file_that_differs_is_named(sessions, change, facts):
     (folder / "friday.hdf5").unlink()
     with raises(DatasetError, "sunday.hdf5", *facts):
         open_demonstrations(folder).index(images=["agentview_image"])
+
+
+def test_a_file_that_names_no_rate_has_that_of_the_others(sessions):
+    folder, _ = sessions
+    for rate, path in zip((None, 25, None, 25), sorted(folder.glob("*.hdf5")), strict=False):
+        with h5py.File(path, "a") as file:
+            del file["data"].attrs["env_args"]
+            if rate is not None:
+                file["data"].attrs["control_freq"] = rate
+    assert open_demonstrations(folder).index().rate == 25
 
 
 def test_poses_beside_deltas_are_refused(tmp_path):

@@ -16,7 +16,7 @@ from tests.data.synthetic import env_args_15
 from tests.errors import raises, refuses
 from tests.fuzz import sandbox
 from warmprior.data import DatasetError
-from warmprior.data.formats.lerobot import LeRobotDemonstrations
+from warmprior.data.formats.lerobot import LeRobotDemonstrations, check_times
 
 LIFT = env_args_15("lift")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -201,13 +201,6 @@ VALUES = {
         table(DATA, observation__state=entry(8, 1.7e9)),
         ["observation.state", "episode 2", "1.7e+09", "row 1", "offset"],
     ),
-    **{
-        f"time stamps of {rate:g} steps per second": (
-            table(DATA, timestamp=lambda times, rate=rate: [time * 20 / rate for time in times]),
-            ["episode 0", "fps", 20, f"{1 / rate:.4g} s", "0.05 s"],
-        )
-        for rate in (15.0, 19.0, 25.0, 30.0)
-    },
     "dropped frames": (
         table(DATA, timestamp=entry(slice(12, 16), [1.0] * 4, None)),
         ["episode 2", "row 5", 20],
@@ -261,6 +254,33 @@ def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
         monkeypatch.setattr("warmprior.data.formats.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
     with raises(DatasetError, root / DATA if name in VALUES else root, *said):
         LeRobotDemonstrations(root, task=LIFT).steps(images=keys)
+
+
+UNEVEN = {
+    "hundredths": lambda times: np.round(times, 2),  # most steps are of 0.03 s
+    "after an hour": lambda times: (times + 3600).astype(np.float32),
+    "after a day": lambda times: (times + 86_400).astype(np.float32),  # 8 ms are the last bit
+    "jitter": lambda times: times + 0.004 * (np.arange(len(times)) % 2),
+    "exact": lambda times: times,
+}
+
+
+@pytest.mark.parametrize("name", UNEVEN)
+@pytest.mark.parametrize("fps", [15, 20, 25, 29, 30, 31, 40, 60])
+def test_another_rate_is_told_from_uneven_time_stamps(name, fps):
+    times = UNEVEN[name](np.arange(300) / 30)
+    if fps == 30 or (name == "after a day" and fps in (25, 29, 31, 40)):
+        check_times(times, fps, "episode 0")
+    else:
+        with raises(DatasetError, "episode 0", "fps", fps, "meta/info.json"):
+            check_times(times, fps, "episode 0")
+
+
+@pytest.mark.parametrize("times", [[0], [0, 0.052], [0, 0.0508, 0.1016], [0, 0.05, 0.1, 0.16]])
+def test_a_short_episode_tells_no_rate(times):
+    check_times(np.array(times, np.float32), 20, "episode 0")
+    with raises(DatasetError, "episode 0", "leaps", "lerobot-edit-dataset"):
+        check_times(np.array([*times, times[-1] + 0.1], np.float32), 20, "episode 0")
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])

@@ -61,7 +61,8 @@ def camera(value):
         ({"observation.environment_state": torch.tensor([[torch.inf, 0.0]] * 2)}, ["infinity"]),
         (camera(torch.full((2, 3, 16, 16), 255.0)), [255, "[0, 1]"]),
         (camera(torch.full((2, 3, 16, 16), -1.0)), [-1, "[0, 1]"]),
-        (camera(torch.full((2, 3, 16, 16), torch.nan)), ["nan", "[0, 1]"]),
+        (camera(torch.full((2, 3, 16, 16), torch.nan)), ["NaN", "[0, 1]"]),
+        (camera(torch.full((2, 3, 16, 16), 9, dtype=torch.uint16)), ["uint16", "[0, 1]"]),
         (camera(torch.full((2, 3, 16, 16), 9, dtype=torch.uint8)), ["uint8", "[0, 1]"]),
     ],
 )

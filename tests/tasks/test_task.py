@@ -17,7 +17,7 @@ from tests.errors import raises, refuses
 from tests.rl.test_images import CameraEnv
 from tests.toy_env import CountingEnv
 from warmprior import GaussianPrior, RestingJoints, RestingTrend, keys
-from warmprior.data import demonstrations_of, open_demonstrations
+from warmprior.data import demonstrations_of, in_memory, open_demonstrations
 from warmprior.envs import NavigationEnv
 from warmprior.history import cold_history
 from warmprior.tasks import Play, Task
@@ -62,6 +62,26 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     assert scaled.identity != task.identity
     single = [own(steps(1, episode=torch.tensor([0]).as_strided([1], [n]))) for n in (0, 1)]
     assert single[0].identity == single[1].identity  # TorchRL's buffers of one step may be expanded numbers
+
+
+@pytest.mark.parametrize(("value", "fact"), [(float("nan"), "NaN"), (2e9, "1e+09"), (-2e9, "1e+09")])
+@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize("key", ["observation", "action"])
+def test_steps_that_no_policy_can_learn_from_are_named(key, normalised, value, fact):
+    raw = steps()
+    raw[key][7, 1] = value
+    with raises(ValueError, key, fact):
+        Task(demonstrations_of(raw, "own", normalised=normalised))
+
+
+def test_images_in_memory_are_resized_once(monkeypatch):
+    raw, seen = steps(), list[int]()
+    image = torch.zeros(len(raw), 3, 20, 30, dtype=torch.uint8)
+    raw["observation"] = TensorDict({"state": raw["observation"], "wrist": image}, [len(raw)])
+    resized = in_memory.resized
+    monkeypatch.setattr(in_memory, "resized", lambda x, *a: seen.append(len(x)) or resized(x, *a))
+    task = Task(demonstrations_of(raw, "own"))
+    assert sum(seen) == len(raw) and task.data["observation", "wrist"].shape[-2:] == (84, 84)
 
 
 @pytest.mark.parametrize("precondition", [False, True])

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from warmprior.checks import check_keys
+from warmprior.checks import LARGEST, all_usable, check_finite_steps, check_keys
 from warmprior.data.checks import check_kept
 from warmprior.data.demonstrations import Demonstrations
 from warmprior.data.index import BLOCK, DatasetIndex
@@ -133,12 +133,20 @@ class _Steps(Demonstrations):
         """Accept any observation: whoever made the steps chose it."""
 
     @override
-    def steps(self, *_: Any, **__: Any) -> TensorDictBase:
+    def steps(
+        self, observations: Sequence[str] | None = None, images: Sequence[str] | None = None, **_: Any
+    ) -> TensorDictBase:
+        """Return the steps, with all images resized, or only those that are named."""
         index, values = self.index(), self._values.clone(False)
-        for key in () if self.normalised else (self._vector, ACTION):
-            exact = values[key].detach().cpu()
-            check_kept(exact.double().numpy(), exact.float().numpy(), f"{key!r} of {self.title}")
-        for key in index.image_keys:
+        for key in (self._vector, ACTION):
+            exact = values[key] = values[key].detach()
+            check_finite_steps(key, exact)
+            if not all_usable(exact):
+                raise ValueError(f"{key!r} of {self.title} has numbers above {LARGEST:g}: subtract an offset")
+            exact = exact.cpu()
+            if not self.normalised:
+                check_kept(exact.double().numpy(), exact.float().numpy(), f"{key!r} of {self.title}")
+        for key in index.image_keys if images is None else images:
             size, blocks = (index.image_size,) * 2, values[OBSERVATION, key].split(BLOCK)
             if self._images[key] != size:
                 values[OBSERVATION, key] = torch.cat([resized(block, size, self.resize) for block in blocks])

@@ -121,18 +121,16 @@ class RobotObservation:
             )
         assert self.normalizer is not None, "without one, every finite number is near"
         loc, scale = self.normalizer.loc(key), self.normalizer.scale(key)
-        # A constant dimension is only shifted: its scale is 1, as that of a range of exactly 2.
-        distance = torch.where(scale == 1, 0.0, normalised.abs())
+        distance = normalised.abs()
         for i in distance.argsort(descending=True).tolist():
             part, number = numbers[i]
             if distance[i] <= FAR:
                 return
             if part not in self._warned:
                 self._warned.add(part)
-                low, high = (loc - scale)[i], (loc + scale)[i]
                 warnings.warn(
-                    f"{part} {number} is {raw[i]:.4g}, far outside of the demonstrations' range from "
-                    f"{low:.4g} to {high:.4g}: give the observation in their unit and order",
+                    f"{part} {number} is {raw[i]:.4g}, far outside of the demonstrations, which leave "
+                    f"{loc[i]:.4g} by {scale[i]:.4g} at most: give the observation in their unit and order",
                     stacklevel=4,
                 )
 
@@ -201,8 +199,10 @@ class RobotObservation:
         if self.recording is None or name in self._warned:
             return
         (height, width), (rows, columns) = image.shape[1:], self.recording.sizes.get(name, shape[1:])
-        # Images of the policy's own size may have been resized before they were recorded.
-        if (rows, columns) != shape[1:] and not math.isclose(width * rows, height * columns, rel_tol=0.02):
+        # Images of the policy's own size may have been resized before they were recorded, or given.
+        if shape[1:] not in ((rows, columns), (height, width)) and not math.isclose(
+            width * rows, height * columns, rel_tol=0.02
+        ):
             self._warned.add(name)
             warnings.warn(
                 f"{self.recording.names.get(name, name)} has {height} x {width} pixels (height x width), and "

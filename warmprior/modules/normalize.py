@@ -27,12 +27,17 @@ def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
         )
 
 
-def warn_of_constant(key: NestedKey, half: Tensor, middle: Tensor, constant: Tensor) -> None:
+def is_constant(half: Tensor, middle: Tensor) -> Tensor:
+    """Return which dimensions count as constant, given half their range and its middle."""
+    return half <= LEAST * middle.abs().clamp(1.0, 1 / LEAST)
+
+
+def warn_of_constant(key: NestedKey, half: Tensor, middle: Tensor) -> None:
     """Warn of dimensions that count as constant although half their range is more than rounding noise."""
     # A body at rest moves by up to LEAST in a simulator; the size of an action is what somebody chose.
     least = LEAST * 1e-3 if key == keys.ACTION else LEAST
     rounding = 4 * torch.finfo(torch.float32).eps * middle.abs()
-    varies = constant & (half > rounding.clamp_min(least))
+    varies = is_constant(half, middle) & (half > rounding.clamp_min(least))
     if varies.any():
         which = [round(2 * float(value), 9) for value in half[varies]]
         warnings.warn(
@@ -102,8 +107,7 @@ class Normalizer(RawUnits):
             # Halved first, because the sum of large numbers may be infinite.
             first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
             loc, half = last + first, last - first
-            constant = half <= LEAST * loc.abs().clamp(1.0, 1 / LEAST)
-            warn_of_constant(key, half, loc, constant)
+            constant = is_constant(half, loc)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 
@@ -142,6 +146,8 @@ class Normalizer(RawUnits):
             middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
             half = torch.where(unit > 0, unit.to(half), half)
             low[key], high[key] = middle - half, middle + half
+        for key in keys:
+            warn_of_constant(key, (high[key] - low[key]) / 2, (high[key] + low[key]) / 2)
         return cls(low, high)
 
     @property

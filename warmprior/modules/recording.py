@@ -76,10 +76,15 @@ class Recording:
         counts = {"demonstrations": self.demonstrations, "steps": self.steps, "held_out": self.held_out}
         check_whole_numbers(0, **counts, **self.observations)
         check_positive(**given(rate=self.rate))
-        for low, high in self.ranges.values():
-            check_finite_numbers(low=low, high=high)
-        for height, width in self.sizes.values():
-            check_whole_numbers(height=height, width=width)
+        if not all(
+            isinstance(ends, Sequence) and len(ends) == 2
+            for ends in (*self.ranges.values(), *self.sizes.values())
+        ):
+            raise ValueError(f"ranges and sizes must be pairs of numbers, got {self.ranges} and {self.sizes}")
+        for name, (low, high) in self.ranges.items():
+            check_finite_numbers(**{f"the least {name}": low, f"the largest {name}": high})
+        for name, (height, width) in self.sizes.items():
+            check_whole_numbers(**{f"the height of {name}": height, f"the width of {name}": width})
         texts = *self.images.values(), *self.names.values(), *chain(*self.left_out.values())
         texts = *texts, *chain(*self.numbers.values())
         if not all(isinstance(text, str) for text in (self.name, self.actions, *texts)):

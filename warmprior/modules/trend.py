@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, override
 
 import torch
 from tensordict import TensorDictBase
@@ -68,6 +68,11 @@ class RestingAction(Registered, RawUnits):
         """The number ``d_a`` of actions."""
         return self.action_loc.numel()
 
+    @property
+    def is_target(self) -> Tensor:
+        """Whether an action is a position target, bool ``[d_a]``."""
+        raise NotImplementedError
+
     def config(self) -> dict[str, Any]:
         """Return name and columns as JSON holds them; the units are buffers."""
         return {"name": self.name, "columns": self.columns.tolist()}
@@ -96,6 +101,11 @@ class RestingPose(RestingAction):
         columns = torch.as_tensor(columns)
         check_shape("columns", columns, ("arms", _POSE))
         super().__init__(columns, (len(columns), _ABSOLUTE), normalizer)
+
+    @property
+    @override
+    def is_target(self) -> Tensor:
+        return (torch.arange(self.width) + 1) % _ABSOLUTE != 0
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the resting action ``[*B, 10 * arms]``."""
@@ -130,10 +140,15 @@ class RestingJoints(RestingAction):
         check_shape("columns", columns, ("d_a",))
         super().__init__(columns, (len(columns),), normalizer)
 
+    @property
+    @override
+    def is_target(self) -> Tensor:
+        return self.columns >= 0
+
     def forward(self, observation: Tensor) -> Tensor:
         """Return the resting action ``[*B, d_a]``."""
         joints = observation[..., self.columns] * self.scale + self.loc
-        return torch.where(self.columns >= 0, (joints - self.action_loc) / self.action_scale, 0.0)
+        return torch.where(self.is_target, (joints - self.action_loc) / self.action_scale, 0.0)
 
     def farthest(self, observation: Tensor, action: Tensor) -> int | None:
         """Return the action farthest from the number it should set, or ``None`` if they are near it.
@@ -141,7 +156,7 @@ class RestingJoints(RestingAction):
         Observations and actions are normalised, ``[N, d_o]`` and ``[N, d_a]``.
         """
         # All targets together: joints may sag below their targets, and one may move less than its noise.
-        targets = self.columns >= 0
+        targets = self.is_target
         off = (action - self(observation)).var(0, correction=0)[targets]
         spread = action.var(0, correction=0)[targets]
         if off.sum() <= NEAR * spread.sum():

@@ -192,7 +192,7 @@ class Task:
                 "leave out what cannot be applied"
             )
         read = partial(demonstrations.steps, index.observation_keys, actions=actions)
-        steps = read()
+        steps = read(())
         if observations is None:
             demonstrations.check_targets(index, steps, joints)  # who names the joints wants them
         targets = index.joints if joints is None else joints

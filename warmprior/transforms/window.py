@@ -324,7 +324,7 @@ class _WindowStorage(TensorStorage):
         numbers = isinstance(index, Tensor) and index.dtype == torch.int64 and index.ndim == 1
         if numbers and index.is_cpu and self.frames.is_cpu:
             with suppress(IndexError):  # of a number that is negative, or outside
-                return self.window._windows(index)  # as below, without a twentieth of a sample's time
+                return self.window._windows(index.clone())  # as below, without a twentieth of the time
         frame = self.frames[index]
         if frame.ndim == 1:
             return self.window._windows(frame)

@@ -15,12 +15,17 @@ def check_observed(batch: Mapping[str, Any], vectors: Iterable[str], images: Ite
         if name in batch and not batch[name].isfinite().all():
             raise ValueError(f"{name} holds NaN or infinity: check the robot's sensors")
     for name in images:
-        if name not in batch:
+        if name not in batch or not batch[name].numel():
             continue
-        low, high = batch[name].aminmax()
-        # Where images are resized, they may overshoot a little.
-        if not (batch[name].is_floating_point() and low > -0.5 and high < 1.5):
-            raise ValueError(
-                f"{name} is {batch[name].dtype} with numbers from {low:.4g} to {high:.4g}, but policies see "
-                "images as floats in [0, 1], as LeRobot loads them: divide bytes by 255"
+        image, held = batch[name], "whole numbers"
+        if image.is_floating_point():
+            low, high = image.aminmax()
+            if low > -0.5 and high < 1.5:  # where images are resized, they may overshoot a little
+                continue
+            held = (
+                "NaN or infinity" if not (low + high).isfinite() else f"numbers from {low:.4g} to {high:.4g}"
             )
+        raise ValueError(
+            f"{name} is {image.dtype} with {held}, but policies see images as floats in [0, 1], as LeRobot "
+            "loads them: divide bytes by 255"
+        )

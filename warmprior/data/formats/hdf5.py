@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from warmprior.checks import LARGEST
 from warmprior.data import checks
 from warmprior.data.checks import (
     DatasetError,
@@ -253,6 +254,17 @@ def _number(group: h5py.Group, name: str) -> float | None:
         return None if value is None else float(np.asarray(value).item())
 
 
+def _rate(file: h5py.File) -> float | None:
+    """Return the control steps per second that a file names, or ``None``."""
+    rate = _number(file["data"], RATE)
+    if rate is not None and not 0 < rate <= LARGEST:
+        raise DatasetError(
+            f"{file.filename}: data.attrs[{RATE!r}] is {rate:g}: write the control steps per second, or "
+            "remove it"
+        )
+    return rate
+
+
 def _check_count(group: h5py.Group, name: str, steps: int) -> None:
     """Compare steps with a group's own count, if there is one: damage can hide demos, and rows be padding."""
     count = _number(group, name)
@@ -472,7 +484,7 @@ class RobomimicDemonstrations(Demonstrations):
             taken_by = dict.fromkeys(present - common, "") | _options(group, common - {*keys, *images})
             if self.mask is None and self.demos is None:
                 _check_count(file["data"], "total", sum(lengths))
-            rate = env_args["env_kwargs"].get("control_freq", 20) if env_args else _number(file["data"], RATE)
+            rate = env_args["env_kwargs"].get("control_freq", 20) if env_args else _rate(file)
         return DatasetIndex(
             path=path,
             demos=selected,

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from warmprior.data.checks import DatasetError, check_count
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.hdf5 import RobomimicDemonstrations, RobomimicReader, open_robomimic
+from warmprior.data.formats.hdf5 import RATE, RobomimicDemonstrations, RobomimicReader, open_robomimic
 from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.data.steps import StoredActions, are_poses
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
 from warmprior.modules.recording import Recording
 
-EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards", "rate")
+EQUAL = ("env_args", "observation_keys", "observation_dims", "image_shapes", "action_dim", "rewards")
 """All files of a folder agree in these entries of their indices."""
 
 ENDINGS = (".hdf5", ".h5")
@@ -97,6 +97,13 @@ class RobomimicFolder(Demonstrations):
                     f"{other.path}: {name} differ from those of {first.path}{values}: keep recordings of one "
                     "environment and robot in a folder, or choose observations that all have"
                 )
+        rates = {index.rate: index.path for index in indices if index.rate is not None}
+        if len(rates) > 1:
+            (one, first_path), (two, second_path), *_ = rates.items()
+            raise DatasetError(
+                f"{second_path} has {two:g} control steps per second, and {first_path} {one:g}: keep them in "
+                f"folders of their own, or correct data.attrs[{RATE!r}]"
+            )
         present = sorted({key for index in indices for key in index.available_keys})
         options = {
             key: {i.taken_by.get(key, "observations") if key in i.available_keys else "" for i in indices}
@@ -108,6 +115,7 @@ class RobomimicFolder(Demonstrations):
         return replace(
             first,
             path=Path(self.place),
+            rate=next(iter(rates), None),
             demos=tuple(demos[: self.demos]),
             lengths=tuple(lengths[: self.demos]),
             available_keys=tuple(present),

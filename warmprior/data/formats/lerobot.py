@@ -35,12 +35,33 @@ from warmprior.io.files import check_regular
 
 DECODED = 2**26  # bytes of frames that are unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, as in LeRobot
-OTHER_RATE = 0.02  # the share by which a rate differs from another
+OTHER_RATE, TELLING = 0.02, 10  # the share by which a rate differs from another, and steps that tell it
 _AGAIN = (
     "It is damaged, or from another dataset. Copy, download, record or convert it again; recordings end with "
     "LeRobotDataset.finalize()."
 )
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or choose others with episodes=."
+
+
+def check_times(times: np.ndarray, fps: float, what: str) -> None:
+    """Raise DatasetError if the time stamps of an episode ``[rows]`` do not fit its rate, or leap."""
+    exact = times.astype(np.float64)
+    steps = np.diff(exact) * fps
+    coarse = fps * np.spacing(abs(times).max(initial=0))  # time stamps in float32 are, after hours
+    # Dropped frames change the mean step, rounded time stamps the median, and another rate both.
+    paces = (np.median(steps), np.mean(steps)) if len(steps) >= TELLING else ()
+    if paces and all(not abs(pace - 1) <= OTHER_RATE + coarse for pace in paces):
+        raise DatasetError(
+            f"{what} has time stamps {np.mean(steps) / fps:.4g} s apart, but fps in meta/info.json is "
+            f"{fps:g}, steps of {1 / fps:.4g} s: correct fps, or resample the dataset"
+        )
+    if (even := abs(steps - 1) <= 0.5 + coarse).all():
+        return
+    row = int(even.argmin())
+    raise DatasetError(
+        f"{what} leaps from {exact[row]:.9g} to {exact[row + 1]:.9g} s at row {row + 1}, at {fps} fps. "
+        f"{_REBUILD}"
+    )
 
 
 class LeRobotReader(DemonstrationReader):
@@ -85,26 +106,8 @@ class LeRobotReader(DemonstrationReader):
                 raise ValueError(f"episode {number} is not where meta/episodes says")
             if "timestamp" in self.index.metadata.features:
                 times = self._column("timestamp")[rows, 0]
-                self._check_times(times, f"{self.index.path / file}: episode {number}")
+                check_times(times, self.index.metadata.fps, f"{self.index.path / file}: episode {number}")
             return self._column(feature)[rows]
-
-    def _check_times(self, times: np.ndarray, what: str) -> None:
-        """Raise DatasetError if time stamps ``[rows]`` do not fit the rate, or leap."""
-        fps, exact = self.index.metadata.fps, times.astype(np.float64)
-        steps = np.diff(exact) * fps
-        coarse = fps * np.spacing(abs(times).max(initial=0))  # time stamps in float32 are, after hours
-        if len(steps) and not abs(np.median(steps) - 1) <= OTHER_RATE + coarse:
-            raise DatasetError(
-                f"{what} has time stamps {np.median(steps) / fps:.4g} s apart, but fps in meta/info.json is "
-                f"{fps:g}, steps of {1 / fps:.4g} s: correct fps, or resample the dataset"
-            )
-        if (even := abs(steps - 1) <= 0.5 + coarse).all():
-            return
-        row = int(even.argmin())
-        raise DatasetError(
-            f"{what} leaps from {exact[row]:.9g} to {exact[row + 1]:.9g} s at row {row + 1}, at {fps} fps. "
-            f"{_REBUILD}"
-        )
 
     def _column(self, name: str) -> np.ndarray:
         """Return a column of the file, ``[rows, width]``, which is read once."""
