@@ -136,6 +136,8 @@ MALFORMED = {
     "features.observation.state.shape": feature("observation.state", shape=[9.5]),
     "features.observation.state.info": feature("observation.state", info=[True]),
     "fps": info_of("fps", "fast"),
+    "total_episodes": info_of("total_episodes", 1e308),
+    "total_frames": info_of("total_frames", "many"),
     "data_path": info_of("data_path", HUGE),
     "video_path": info_of("video_path", "{video_key.__class__}/{chunk_index}"),
     "codebase_version": info_of("codebase_version", 3),

@@ -186,6 +186,8 @@ def _check_info(info: Any) -> str:
     if version != LEROBOT_VERSION:
         return version  # whose other entries are different
     need("fps", fps, isinstance(fps, int | float) and fps > 0)
+    for name in ("total_episodes", "total_frames"):
+        need(name, info.get(name), type(info.get(name)) is int)
     need("features", features, isinstance(features, dict))
     for name, feature in features.items():
         need(f"features.{name}", feature, isinstance(feature, dict))
