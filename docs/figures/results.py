@@ -60,8 +60,8 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
 WARM = (PAST, PREVIEW, CORRELATED)
 LIFT_AGENTS = "agents_lift"
 AGENTS = {
-    "weak policies on lift, three seeds": LIFT_AGENTS,
-    "policies on square, one training each": "agents_square_mh_5000",
+    "lift, weak policies, three seeds": LIFT_AGENTS,
+    "square, one or two seeds": "agents_square_mh_5000",
 }
 
 

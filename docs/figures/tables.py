@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pandas import DataFrame, read_json
@@ -14,6 +15,7 @@ from shared import DATA, GAUSSIAN, SOURCES, read_arms, read_played, shown_source
 from lab.measures.statistics import chosen_elsewhere
 
 SLOPES = {"marginal": "over all data", "conditional": "given the observation", "none": "no preconditioning"}
+OBSERVED = {2: "2 (the default)", 1: "1"}
 SHOWN = {"perfect": "perfect (Algorithm 1)", "others": "of policies that have not seen the episode"}
 
 TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
@@ -77,14 +79,15 @@ def _played_line(nfe: int, noise: str, solved: Mapping[str, np.ndarray], names: 
 def study_table(column: str, name: str) -> str:
     """Return success of a run in Markdown, in percent: a line per setting and source, a column per value."""
     rows = read_played(name)
-    if len(rows[["nfe", "noise", "iterations"]].drop_duplicates()) > 1:
+    if len(rows[["noise", "iterations"]].drop_duplicates()) > 1:
         raise ValueError(
             f"{name}: these rows differ in more than {column}, so no column per value holds them"
         )
     values = sorted(rows[column].unique(), reverse=column == "sigma")
     text = [f"| {'H' if column == 'chunk' else column} | {' | '.join(f'{v:g}' for v in values)} |"]
     text.append("|---" * (1 + len(values)) + "|")
-    for (task, data), part in rows.groupby(["task", "data"], sort=False):
+    several = rows["nfe"].nunique() > 1
+    for (task, data, nfe), part in rows.groupby(["task", "data", "nfe"], sort=False):
         for source in shown_sources(part):
             outcomes = (
                 part[part["source"] == source]
@@ -92,15 +95,16 @@ def study_table(column: str, name: str) -> str:
                 .agg(lambda solved: 100 * np.concatenate(list(solved)).mean())
             )
             entries = [f"{outcomes[v] + 1e-6:.0f}" if v in outcomes else "" for v in values]
-            text.append(f"| {task} {data}, {SOURCES[source][0]} | {' | '.join(entries)} |")
+            at = f", NFE {nfe}" if several else ""
+            text.append(f"| {task} {data}, {SOURCES[source][0]}{at} | {' | '.join(entries)} |")
     return "\n".join(text) + "\n"
 
 
-def setting_table(column: str, labels: Mapping[str, str], name: str) -> str:
+def setting_table(column: str, labels: Mapping[Any, str], name: str) -> str:
     """Return success in Markdown, in percent, with that of each training: a line per NFE and setting."""
     rows = read_played(name)
     names = shown_sources(rows)
-    text = [f"| NFE | {column} | {' | '.join(SOURCES[source][0] for source in names)} |"]
+    text = [f"| NFE | {column.replace('_', ' ')} | {' | '.join(SOURCES[source][0] for source in names)} |"]
     text.append("|---" * (2 + len(names)) + "|")
     for nfe in sorted(rows["nfe"].unique(), reverse=True):
         for setting in (name for name in labels if (rows[column] == name).any()):
@@ -206,6 +210,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "sigma": partial(study_table, "sigma"),
     "chunk": partial(study_table, "chunk"),
     "slope": partial(setting_table, "slope", SLOPES),
+    "observed": partial(setting_table, "observation_steps", OBSERVED),
     "shown": partial(setting_table, "forecast", SHOWN),  # to WP-Preview in training
     "curve": curve_table,
     "curvature": curvature_table,
