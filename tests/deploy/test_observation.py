@@ -214,20 +214,33 @@ def said_of(executor, *observations):
     return [str(warning.message) for warning in caught]
 
 
+def test_the_vector_that_lacks_is_named():
+    whole = {
+        "observation.state": np.zeros(2),
+        "effort": np.zeros(1),
+        "front_image": seen_at([0])["front_image"],
+    }
+    with AsyncExecutor(described(), latency=0) as executor:
+        for name in ("observation.state", "effort"):
+            with raises(KeyError, f"missing: ['{name}']"):
+                executor.act({key: value for key, value in whole.items() if key != name})
+        executor.act(whole)
+
+
 def test_one_is_warned_once_of_numbers_far_from_the_demonstrations():
     """Half their range beyond an end: lift from 0 to 80, whose demonstrations are from 20 to 60."""
     with AsyncExecutor(described(), latency=0) as executor:
         near = [seen_at(state) for state in ([-199.0, 1.0, 7.0], [199.0, 79.0, 7.0], [0.0, 40.0, 8.5])]
         assert not said_of(executor, *near)
         (said,) = said_of(executor, seen_at([210.0, 4000.0, 7.0]), seen_at([0.0, -4000.0, 7.0]))
-        assert not missing(said, "observation.state lift", 4000, 40, 20)
+        assert not missing(said, "observation.state lift", 4000, 20, 60)
         executor.reset()
         assert not said_of(executor, seen_at([0.0, 4000.0, 7.0]))
         (said,) = said_of(executor, seen_at([0.0, 40.0, 999.0]))
         assert not missing(said, "effort [0]", 999, 7)
     with AsyncExecutor(described(high=(100.0, 60.0, 11.0)), latency=0) as executor:
         first, second = said_of(executor, seen_at([-300.0, 40.0, 17.0]))
-        assert not missing(first, "effort [0]", 17, 9, 2) and not missing(second, "pan", -300, 0, 100)
+        assert not missing(first, "effort [0]", 17, 7, 11) and not missing(second, "pan", -300, -100, 100)
     with AsyncExecutor(described(normalizer=False), latency=0) as executor:
         assert not said_of(executor, seen_at([0.0, 4000.0, 7.0]))
 

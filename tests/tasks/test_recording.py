@@ -67,6 +67,17 @@ def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
     assert line in capsys.readouterr().out
 
 
+def test_an_observation_that_counts_as_constant_is_named(tmp_path):
+    path = robot_file(tmp_path / "arm.hdf5")
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            rows = len(demo["actions"])
+            demo["obs/gps"] = 48 + 1e-4 * np.linspace([-1, -1], [1, 0], rows)
+    demonstrations = open_demonstrations(path)
+    with pytest.warns(UserWarning, match=r"gps \[0\] by 0.000198.*gps \[1\].*constant"):
+        Task(demonstrations, observations=[*demonstrations.index().observation_keys])
+
+
 def test_unknown_joints_are_named_before_images_are_read(tmp_path, monkeypatch):
     demonstrations = open_demonstrations(robot_file(tmp_path / "arm.hdf5"))
     monkeypatch.setattr("warmprior.data.image_cache.read_images", lambda *_: pytest.fail("was read"))

@@ -128,9 +128,12 @@ class RobotObservation:
                 return
             if part not in self._warned:
                 self._warned.add(part)
+                low, high = (loc - scale)[i], (loc + scale)[i]
+                # The scale is 1 where the demonstrations are constant, too.
+                seen = f"within 1 of {loc[i]:.4g}" if scale[i] == 1 else f"from {low:.4g} to {high:.4g}"
                 warnings.warn(
-                    f"{part} {number} is {raw[i]:.4g}, far outside of the demonstrations, which leave "
-                    f"{loc[i]:.4g} by {scale[i]:.4g} at most: give the observation in their unit and order",
+                    f"{part} {number} is {raw[i]:.4g}, far outside of the demonstrations, which are {seen}: "
+                    "give the observation in their unit and order",
                     stacklevel=4,
                 )
 
@@ -164,6 +167,8 @@ class RobotObservation:
             own = {keys.STATE: [*self.recording.observations], **self.recording.names}
             there += f"; the demonstrations' own names are {own}"
             given = self._renamed(given, self.recording)
+            if keys.STATE not in given and given.keys() & self.recording.observations.keys():
+                check_keys(given, self.recording.observations, "the policy", there)  # some of several
         # An empty vector, of a policy of images that sees the history, is not asked of the driver.
         given |= {name: () for name, shape in self.shapes.items() if tuple(shape) == (0,)}
         check_keys(given, self.shapes, "the policy", there)

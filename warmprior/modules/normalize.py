@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import torch
@@ -32,17 +32,20 @@ def is_constant(half: Tensor, middle: Tensor) -> Tensor:
     return half <= LEAST * middle.abs().clamp(1.0, 1 / LEAST)
 
 
-def warn_of_constant(key: NestedKey, half: Tensor, middle: Tensor) -> None:
+def warn_of_constant(
+    key: NestedKey, half: Tensor, middle: Tensor, names: Sequence[str] | None = None
+) -> None:
     """Warn of dimensions that count as constant although half their range is more than rounding noise."""
     # A body at rest moves by up to LEAST in a simulator; the size of an action is what somebody chose.
     least = LEAST * 1e-3 if key == keys.ACTION else LEAST
     rounding = 4 * torch.finfo(torch.float32).eps * middle.abs()
     varies = is_constant(half, middle) & (half > rounding.clamp_min(least))
     if varies.any():
-        which = [round(2 * float(value), 9) for value in half[varies]]
+        numbers = varies.nonzero().flatten().tolist()
+        parts = [f"{names[i] if names else f'[{i}]'} by {2 * float(half[i]):.3g}" for i in numbers]
         warnings.warn(
-            f"of {key!r} the dimensions {varies.nonzero().flatten().tolist()} vary by {which} and count as "
-            "constant: if they matter, subtract an offset, or use a smaller unit, such as millimetres",
+            f"{key!r} varies in {', '.join(parts)}, which counts as constant: if it matters, subtract an "
+            "offset, or use a smaller unit, such as millimetres",
             stacklevel=3,
         )
 
@@ -118,6 +121,7 @@ class Normalizer(RawUnits):
         keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION),
         *,
         units: Mapping[NestedKey, Tensor] | None = None,
+        names: Mapping[NestedKey, Sequence[str]] | None = None,
     ) -> Normalizer:
         """Return a normaliser with the minimum and maximum over all steps of a dataset.
 
@@ -126,6 +130,7 @@ class Normalizer(RawUnits):
             keys: the entries to normalise.
             units: raw sizes ``[d]`` of one normalised unit, per key; 0 stands for half the range. Values
                 are still centred on the range, and may leave ``[-1, 1]``.
+            names: names of the dimensions of keys, for a warning of those that vary and count as constant.
 
         Raises:
             KeyError: if a key is missing.
@@ -147,7 +152,8 @@ class Normalizer(RawUnits):
             half = torch.where(unit > 0, unit.to(half), half)
             low[key], high[key] = middle - half, middle + half
         for key in keys:
-            warn_of_constant(key, (high[key] - low[key]) / 2, (high[key] + low[key]) / 2)
+            middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
+            warn_of_constant(key, half, middle, (names or {}).get(key))
         return cls(low, high)
 
     @property

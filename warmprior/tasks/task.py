@@ -211,7 +211,9 @@ class Task:
         self.clip: float | Sequence[float] | None = None
         if not demonstrations.normalised:
             units = None if recorded is None else recorded.units
-            self.normalizer = Normalizer.fit(steps, (vector, ACTION), units=units)
+            widths = zip(index.observation_keys, index.observation_dims, strict=True)
+            names = [f"{key} [{i}]" for key, width in widths for i in range(width)]
+            self.normalizer = Normalizer.fit(steps, (vector, ACTION), units=units, names={vector: names})
             self.data = self.normalizer.normalize(self.data)
             self.clip = bound_of(self.data[ACTION])
         self.make_env: Callable[..., EnvBase] = play.make_env or _no_environment

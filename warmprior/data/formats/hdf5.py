@@ -247,21 +247,19 @@ def read_described(file: h5py.File, name: str) -> Any:
         return json.loads(attributes[name]) if name in attributes else None
 
 
-def _number(group: h5py.Group, name: str) -> float | None:
+def _number(group: h5py.Group, name: str, advice: str = _AGAIN) -> float | None:
     """Return a number among a group's attributes, or ``None`` if there is none."""
-    with checks.reading(f"{_place(group)}.attrs[{name!r}]", _AGAIN):
+    with checks.reading(f"{_place(group)}.attrs[{name!r}]", advice):
         value = group.attrs.get(name)
         return None if value is None else float(np.asarray(value).item())
 
 
 def _rate(file: h5py.File) -> float | None:
     """Return the control steps per second that a file names, or ``None``."""
-    rate = _number(file["data"], RATE)
+    advice = "Write the control steps per second, or remove it."
+    rate = _number(file["data"], RATE, advice)
     if rate is not None and not 0 < rate <= LARGEST:
-        raise DatasetError(
-            f"{file.filename}: data.attrs[{RATE!r}] is {rate:g}: write the control steps per second, or "
-            "remove it"
-        )
+        raise DatasetError(f"{file.filename}: data.attrs[{RATE!r}] is {rate:g}. {advice}")
     return rate
 
 
