@@ -27,19 +27,26 @@ def check_width(key: NestedKey, shape: torch.Size, loc: Tensor) -> None:
         )
 
 
-def is_constant(half: Tensor, middle: Tensor) -> Tensor:
-    """Return which dimensions count as constant, given half their range and its middle."""
+def middle_and_half(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the middle of a range and half of it."""
+    # Halved first, because the sum of large numbers may be infinite.
+    first, last = (value.detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
+    return last + first, last - first
+
+
+def is_constant(middle: Tensor, half: Tensor) -> Tensor:
+    """Return which dimensions count as constant, given the middle of their range and half of it."""
     return half <= LEAST * middle.abs().clamp(1.0, 1 / LEAST)
 
 
 def warn_of_constant(
-    key: NestedKey, half: Tensor, middle: Tensor, names: Sequence[str] | None = None
+    key: NestedKey, middle: Tensor, half: Tensor, names: Sequence[str] | None = None
 ) -> None:
     """Warn of dimensions that count as constant although half their range is more than rounding noise."""
     # A body at rest moves by up to LEAST in a simulator; the size of an action is what somebody chose.
     least = LEAST * 1e-3 if key == keys.ACTION else LEAST
     rounding = 4 * torch.finfo(torch.float32).eps * middle.abs()
-    varies = is_constant(half, middle) & (half > rounding.clamp_min(least))
+    varies = is_constant(middle, half) & (half > rounding.clamp_min(least))
     if varies.any():
         numbers = varies.nonzero().flatten().tolist()
         parts = [f"{names[i] if names else f'[{i}]'} by {2 * float(half[i]):.3g}" for i in numbers]
@@ -107,10 +114,8 @@ class Normalizer(RawUnits):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
             if (low[key] > high[key]).any():
                 raise ValueError(f"{key}: a minimum is above its maximum")
-            # Halved first, because the sum of large numbers may be infinite.
-            first, last = (value[key].detach().to(torch.get_default_dtype()) / 2 for value in (low, high))
-            loc, half = last + first, last - first
-            constant = is_constant(half, loc)
+            loc, half = middle_and_half(low[key], high[key])
+            constant = is_constant(loc, half)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 
@@ -152,8 +157,7 @@ class Normalizer(RawUnits):
             half = torch.where(unit > 0, unit.to(half), half)
             low[key], high[key] = middle - half, middle + half
         for key in keys:
-            middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
-            warn_of_constant(key, half, middle, (names or {}).get(key))
+            warn_of_constant(key, *middle_and_half(low[key], high[key]), (names or {}).get(key))
         return cls(low, high)
 
     @property
