@@ -1,4 +1,4 @@
-"""What is checked of demonstrations in any format, and its error."""
+"""All formats check their demonstrations by these functions, which raise one error."""
 
 from __future__ import annotations
 

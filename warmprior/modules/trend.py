@@ -70,7 +70,7 @@ class RestingAction(Registered, RawUnits):
 
     @property
     def is_target(self) -> Tensor:
-        """Whether an action is a position target, bool ``[d_a]``."""
+        """Return whether each action is a position target, bool ``[d_a]``."""
         raise NotImplementedError
 
     def config(self) -> dict[str, Any]:
