@@ -4,8 +4,6 @@ import shutil
 import sys
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.errors import missing
@@ -13,13 +11,12 @@ from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
 from warmprior import (
     PastPrior,
-    RestingJoints,
     VelocityMLP,
     VelocityNetwork,
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.__main__ import errors_of, main
+from warmprior.__main__ import main
 from warmprior.saving.policies import load_policy, save_policy
 
 pytest.importorskip("robosuite")
@@ -246,23 +243,6 @@ def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):
     assert "NFE 1:" in said and "NFE 3:" not in said and "--nfe 1\n" in said
     sampling = load_policy(said.splitlines()[-1]).sampling
     assert sampling.nfe == sampling.max_nfe == 1
-
-
-def test_errors_stand_beside_those_of_actions_that_know_nothing():
-    lengths, chunk = (12, 9), 4
-    episode = torch.repeat_interleave(torch.arange(2), torch.tensor(lengths))
-    observation, action = (torch.rand(21, 3, generator=torch.Generator().manual_seed(i)) for i in (0, 1))
-    data = TensorDict({"observation": observation, "action": action[:, :2], "episode": episode}, [21])
-    policy = WarmPriorActor(VelocityMLP(2, 3, chunk), PastPrior(chunk))
-    mean, (still, always) = torch.tensor([0.25, 0.75]), ([], [])
-    errors, others = errors_of(policy, data, [1], mean, RestingJoints([2, -1]))
-    for i in range(21):
-        for k in range(i, min(i + chunk, lengths[0] if i < lengths[0] else 21)):
-            still.append((data["action"][k] - torch.stack((observation[i, 2], mean[1]))).square())
-            always.append((data["action"][k] - mean).square())
-    expected = (torch.stack(terms).mean().item() for terms in (always, still))
-    assert list(others.values()) == pytest.approx(list(expected), rel=1e-5)
-    assert list(errors) == [1] and len(errors_of(policy, data, [1], mean, None)[1]) == 1
 
 
 @pytest.mark.parametrize(("task", "env_name"), [("lift", "MyKitchen"), ("stack_d0", "Stack_D0")])

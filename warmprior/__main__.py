@@ -25,11 +25,7 @@ from warmprior.options.train_command import Data, Evaluation, Run
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:  # commands import what they need: PyTorch takes seconds, and help does without
-    from tensordict import TensorDictBase
-    from torch import Tensor
-
     from warmprior.modules.actor import WarmPriorActor
-    from warmprior.modules.trend import RestingAction
 
 Imported = tyro.conf.UseAppendAction[
     Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE")]
@@ -315,6 +311,7 @@ def train(
         network: options of the velocity network
     """
     from warmprior.data import open_demonstrations
+    from warmprior.diagnostics.held_out import held_out_errors
     from warmprior.envs.description import is_registered
     from warmprior.modules.prior import Prior
     from warmprior.modules.sampling import Sampling
@@ -386,7 +383,7 @@ def train(
             f"{len(left_out):,} steps):"
         )
         mean = task.data["action"].mean(0)
-        errors, others = errors_of(actor, left_out, (*nfes, sampling.evaluations()), mean, task.rest)
+        errors, others = held_out_errors(actor, left_out, (*nfes, sampling.evaluations()), mean, task.rest)
         for name, error in {**{f"NFE {n}": error for n, error in errors.items()}, **others}.items():
             print(f"  {name}: {error:.4f}")
         if min(errors.values()) >= (least := min(others.values())):
@@ -401,36 +398,6 @@ def train(
 
 
 train.__doc__ = str(train.__doc__).format(PLACES=PLACES)
-
-
-def errors_of(
-    actor: WarmPriorActor, data: TensorDictBase, nfes: Sequence[int], mean: Tensor, rest: RestingAction | None
-) -> tuple[dict[int, float], dict[str, float]]:
-    """Return the errors of actions on up to 4,096 windows of held-out normalised steps, by NFE.
-
-    And those of actions that need no policy: the training's ``mean`` ``[d_a]``, and with a resting action
-    staying where the robot is, with that mean where an action is no position target.
-    """
-    import torch
-    from tensordict import TensorDict
-
-    from warmprior.diagnostics import action_error, encoded_windows
-    from warmprior.keys import CHUNK, FRAME, IS_PAD, OBSERVATION
-    from warmprior.modules.trend import vector_of
-    from warmprior.transforms.window import window_transforms
-
-    network: Any = actor.network
-    windows = window_transforms(data, actor.prior, observation_steps=network.observation_steps)
-    frames = torch.linspace(0, len(data) - 1, min(len(data), 4096)).round().long()
-    batch = windows(TensorDict({FRAME: frames}, [len(frames)]))
-    known = {"always the mean action": mean}
-    if rest is not None:
-        resting = torch.where(rest.is_target, rest(vector_of(batch[OBSERVATION])[:, -1]), mean)
-        known["staying where the robot is"] = resting.unsqueeze(1)
-    executed = slice(None, actor.prior.chunk_length)
-    target, inside = batch[CHUNK][:, executed], ~batch[IS_PAD][:, executed]
-    others = {name: float((target - action).square()[inside].mean()) for name, action in known.items()}
-    return action_error(actor, encoded_windows(actor, batch), nfes=nfes), others
 
 
 def export(

@@ -120,7 +120,7 @@ def sentences() -> dict[str, list[str]]:
     fifty = [whole(pusht[50][s]) for s in (PAST, CORRELATED, GAUSSIAN)]
     noise = played("sigma_square_mh", PAST, 1).set_index("sigma")["success_rate"] * 100
     past, preview_once, mip = (beside_source(*s) for s in ((PAST, 9), (PREVIEW, 1), ("mip", 2)))
-    cvae_l1 = partial(beside_source, f"{CVAE},l1", baseline=f"{GAUSSIAN}{L1}", sets=LEARNED_L1)
+    cvae_l1 = partial(beside_source, f"{CVAE}{L1}", baseline=f"{GAUSSIAN}{L1}", sets=LEARNED_L1)
     with_l1, with_l1_at_best = ({n: cvae_l1(n, own_noise=own) for n in (9, 1)} for own in (True, False))
     at_best = {n: beside_source(CVAE, n, own_noise=False) for n in (9, 3, 1)}
     past_once = beside_source(PAST, 1, sets=SCRIPTED)
