@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
-from comparisons import Comparison
 from leaderboard import LEARNED_L1, SCRIPTED, beside_source, paper_gain, standings
 from pandas import DataFrame
 from results import (
@@ -19,7 +18,6 @@ from results import (
     LENGTHS,
     LIFT_AGENTS,
     LONG,
-    MANY,
     SHORT,
     TEN,
     TWENTY_FIVE,
@@ -74,17 +72,6 @@ def gain(runs: Iterable[str], source: str, nfe: int) -> float:
     return mean(runs, source, nfe) - mean(runs, GAUSSIAN, nfe)
 
 
-def chances(comparisons: Iterable[Comparison]) -> str:
-    """Return the p-values of comparisons as a sentence has them."""
-    return ", ".join(comparison.chance for comparison in comparisons)
-
-
-def beside_gaussian(runs: Iterable[str], source: str) -> str:
-    """Return the mean success of a source and the Gaussian source over the tasks of some runs, by NFE."""
-    rates = (spaced(mean(runs, name, nfe) for nfe in (9, 3, 1)) for name in (source, GAUSSIAN))
-    return " against ".join(f"{each}%" for each in rates)
-
-
 def improved(arm: str) -> str:
     """Return the mean success of the policies of agents on lift, and of the agents in the end."""
     rates = read_arms(LIFT_AGENTS).query("arm == @arm").groupby("evaluated")["success_rate"].mean()
@@ -97,12 +84,13 @@ def sentences() -> dict[str, list[str]]:
     rates = {setting: whole(mean) for setting, mean in board["mean"].items()}
     few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
-    long, better = (all_lengths(PAST, choose) for choose in CHOICES.values())
-    correlated_long = all_lengths(CORRELATED, CHOICES["long training"])
-    long_rates, better_rates, default_rates = (
-        [spaced(c.rates[k] for c in of) for k in (0, 1)] for of in (long, better, correlated_long)
+    long_rates, default_rates = (
+        [
+            spaced(comparison.rates[k] for comparison in all_lengths(source, CHOICES["long training"]))
+            for k in (0, 1)
+        ]
+        for source in (PAST, CORRELATED)
     )
-    scripted = {name: beside_gaussian(GROUPS[name], CORRELATED) for name in (TWENTY_FIVE, MANY)}
     lengths = read_cells((SHORT[-1], LONG[-1]), common_seeds=True).query("nfe == 1")
     transport = [
         whole(lengths[(lengths["run"] == runs[-1]) & (lengths["source"] == s)]["success"].mean())
@@ -134,23 +122,17 @@ def sentences() -> dict[str, list[str]]:
     paper = {s: " / ".join(f"{paper_gain(s, nfe):.1f}" for nfe in (9, 3, 1)) for s in (PAST, PREVIEW)}
     return {
         "../README.md": [
-            f"{rates[PAST, 9]}% against {rates[GAUSSIAN, 9]}% ({past.in_trainings}, {past.chance})",
-            f"The difference at NFE 1, {rates[PAST, 1]}% against {rates[GAUSSIAN, 1]}%, may be due to chance",
-            f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1",
-            f"({past_once.in_trainings}, {past_once.chance})",
-            f"{span(short)} points lower at NFE 1 after short training",
-            f"with WP-Past**: {long_rates[0]}% against {long_rates[1]}% ({chances(long)})",
-            f"clear difference** for WP-Past: {better_rates[0]}% against {better_rates[1]}%",
-            f"{default_rates[0]}% against {default_rates[1]}% ({chances(correlated_long)})",
-            f"the four human datasets at NFE 9 ({rates[CORRELATED, 9]}% against {rates[GAUSSIAN, 9]}%)",
-            f"with 25 scripted demonstrations ({scripted[TWENTY_FIVE]})",
-            f"with 300 after 80,000 iterations ({scripted[MANY]})",
+            f"with WP-Past at NFE 9**: {rates[PAST, 9]}% against {rates[GAUSSIAN, 9]}% ({past.chance})",
+            f"{span(few)} points more with WP-Past and WP-Preview ({past_once.chance} for the largest gain)",
+            f"{span(short)} points less at NFE 1 after short training",
+            f"with WP-Past**: {long_rates[0]}% against {long_rates[1]}%",
+            f"after 80,000 iterations**: {default_rates[0]}% against {default_rates[1]}%",
             f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% of episodes at NFE 9 ({learned[9].chance} "
             "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",
             f"with an L1 loss {rates[f'{GAUSSIAN}{L1}', 9]}% at NFE 9 ({absolute.chance})",
             agents,
-            f"{paper[PAST]} points higher with WP-Past, and {paper[PREVIEW]} points higher with WP-Preview",
+            f"{paper[PAST]} points more with WP-Past, and {paper[PREVIEW]} with WP-Preview",
         ],
         "which_source.md": [
             f"WP-Past and WP-Preview score {span(few)} points higher at NFE 1 on average, which may be "
