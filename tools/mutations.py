@@ -29,11 +29,6 @@ FAULTS = [  # (line, its replacement, names of test files)
     ("time = begin + (step + sum(row)) * h", "time = begin + step * h", "ode"),
     ("return 1 - t, t, -one, one", "return 1 - t, t, one, one", "ode flow_matching preconditioning"),
     ("alpha * d_beta + d_alpha * beta, c)", "alpha * d_beta - d_alpha * beta, c)", "preconditioning"),
-    (
-        "torch.hypot(remainder, (best - slope) / scale)",
-        "remainder + (best - slope) / scale",
-        "preconditioning",
-    ),
     ("total = weight.sum() * error.shape[-1]", "total = weight.sum()", "flow_matching"),
     ("alpha=self.gamma**i)", "alpha=self.gamma)", "chunk"),
     ("draw < self.probability", "draw > self.probability", "history window"),

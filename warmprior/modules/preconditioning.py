@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, get_args
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,22 +12,15 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.checks import check_choice, check_positions, check_shape, check_whole_numbers
+from warmprior.checks import check_positions, check_shape, check_whole_numbers
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.modules.trend import VARIANCE_FLOOR, RestingTrend, vector_of
-from warmprior.options.training import Slope
+from warmprior.modules.trend import VARIANCE_FLOOR, RestingTrend
 
 CORRELATION_LIMIT = 1 - 1e-6
 """The largest correlation; above it source and target determine each other."""
-
-RIDGE = 1e-5
-"""The penalty of the regression on the observation, in units of its normalised entries."""
-
-
-_SECOND = ("source_variance", "target_variance", "covariance")
 
 
 class SourceMoments(nn.Module):
@@ -43,7 +36,6 @@ class SourceMoments(nn.Module):
         source_variance: :math:`v_0`.
         target_variance: :math:`v_1`.
         covariance: :math:`c = Cov(a_0, a_1)`.
-        given: :math:`v_0`, :math:`v_1` and :math:`c` given the observation; by default those over all data.
 
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
@@ -61,6 +53,9 @@ class SourceMoments(nn.Module):
         [True, True, True, True, False, False, False, False]
     """
 
+    positive = ("source_variance", "target_variance", "conditional_deviation")
+    """The names of the buffers that are scales."""
+
     def __init__(
         self,
         source_mean: Tensor,
@@ -68,13 +63,9 @@ class SourceMoments(nn.Module):
         source_variance: Tensor,
         target_variance: Tensor,
         covariance: Tensor,
-        *,
-        given: Sequence[Tensor] | None = None,
     ) -> None:
         super().__init__()
-        second = (source_variance, target_variance, covariance)
-        self.conditional = given is not None
-        moments = (source_mean, target_mean, *second, *(given or ()))
+        moments = (source_mean, target_mean, source_variance, target_variance, covariance)
         shapes = [tuple(value.shape) for value in moments]
         if len(set(shapes)) > 1 or source_mean.ndim != 2:
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
@@ -82,30 +73,23 @@ class SourceMoments(nn.Module):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
         # Copies, so that a tensor given twice does not become one buffer under two names.
         self.source_mean, self.target_mean = (nn.Buffer(mean.clone()) for mean in moments[:2])
-        for prefix, (*variances, c) in {"": second, **({"given_": given} if given else {})}.items():
-            v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in variances)
-            limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
-            c = c.double().clamp(-limit, limit)
-            # The target's deviation given the source, in float64: lower precisions would lose the difference.
-            q = (v1 - c.square() / v0).sqrt()
-            for name, value in zip((*_SECOND, "conditional_deviation"), (v0, v1, c, q), strict=True):
-                self.register_buffer(prefix + name, value.to(source_mean.dtype))
+        v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance))
+        limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
+        c = covariance.double().clamp(-limit, limit)
+        # The target's deviation given the source, in float64: lower precisions would lose the difference.
+        q = (v1 - c.square() / v0).sqrt()
+        self.source_variance, self.target_variance, self.covariance, self.conditional_deviation = (
+            nn.Buffer(value.to(source_mean.dtype)) for value in (v0, v1, c, q)
+        )
 
-    @property
-    def positive(self) -> list[str]:
-        """The names of the buffers that are scales."""
-        names = ("source_variance", "target_variance", "conditional_deviation")
-        return [prefix + name for prefix in (("", "given_") if self.conditional else ("",)) for name in names]
-
-    def config(self) -> dict[str, bool]:
-        """Return the further arguments of :meth:`identity`; the values themselves are buffers."""
-        return {"conditional": self.conditional}
+    def config(self) -> None:
+        """Return nothing, because the values are buffers."""
 
     @classmethod
-    def identity(cls, prediction_length: int, action_dim: int, conditional: bool = False) -> SourceMoments:
+    def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
         """Return moments of independent standard normal ends, to be replaced by loading a state dict."""
         zero, one = (f(prediction_length, action_dim) for f in (torch.zeros, torch.ones))
-        return cls(zero, zero, one, one, zero, given=(one, one, zero) if conditional else None)
+        return cls(zero, zero, one, one, zero)
 
     @classmethod
     @torch.no_grad()
@@ -117,7 +101,6 @@ class SourceMoments(nn.Module):
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         samples: int = 16_384,
         trend: RestingTrend | None = None,
-        slope: Slope = "marginal",
         observation_key: NestedKey = keys.OBSERVATION,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
@@ -132,15 +115,12 @@ class SourceMoments(nn.Module):
             coupling: how the training pairs sources and targets, see :data:`~warmprior.Coupling`.
             samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
-            slope: ``"conditional"`` also estimates moments given the observation: those of what a ridge
-                regression on the observation (its vector, if it has images) leaves of source and target.
             observation_key: key of the policy's observation, which the prior, coupling or trend may read.
             generator: draws the source samples, on the windows' device.
 
         Raises:
             ValueError: if there are fewer than two windows, or their lengths do not fit the prior.
         """
-        check_choice("slope", slope, get_args(Slope))
         if isinstance(windows, TensorDictBase):
             batches = [windows]
         else:
@@ -175,32 +155,10 @@ class SourceMoments(nn.Module):
             return (weight * values).sum(0) / count.clamp_min(1)
 
         m0, m1 = mean(a0), mean(a1)
-        unpadded = (count > 0).expand_as(m0)
-
-        def second(r0: Tensor, r1: Tensor) -> list[Tensor]:
-            v0, v1 = (torch.where(unpadded, mean(r.square()), 1.0) for r in (r0, r1))
-            return [value.to(torch.get_default_dtype()) for value in (v0, v1, mean(r0 * r1))]
-
         a0, a1 = a0 - m0, a1 - m1
-        given = (
-            second(*_unexplained(vector_of(observation), weight, a0, a1)) if slope == "conditional" else None
-        )
-        means = (value.to(torch.get_default_dtype()) for value in (m0, m1))
-        return cls(*means, *second(a0, a1), given=given)
-
-
-def _unexplained(observation: Tensor, weight: Tensor, *ends: Tensor) -> list[Tensor]:
-    """Return what a ridge regression on observations ``[N, To, d_o]`` leaves of chunks ``[N, P, d_a]``."""
-    x = observation.double().flatten(1)
-    x = torch.cat((x, torch.ones_like(x[:, :1])), 1)
-    # Padded positions repeat the last action. Their zero weight leaves them out, position by position.
-    gram = torch.einsum("npi,nd,ne->pde", weight, x, x)
-    gram = gram + RIDGE * len(x) * torch.eye(x.shape[1], dtype=x.dtype, device=x.device)
-    predicted = (
-        torch.einsum("nd,pdi->npi", x, torch.linalg.solve(gram, torch.einsum("nd,npi->pdi", x, weight * end)))
-        for end in ends
-    )
-    return [end - value for end, value in zip(ends, predicted, strict=True)]
+        v0, v1 = (torch.where((count > 0).expand_as(m0), mean(a.square()), 1.0) for a in (a0, a1))
+        moments = (m0, m1, v0, v1, mean(a0 * a1))
+        return cls(*(value.to(torch.get_default_dtype()) for value in moments))
 
 
 class PreconditionedNetwork(VelocityNetwork):
@@ -215,11 +173,9 @@ class PreconditionedNetwork(VelocityNetwork):
         F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
 
     The first two terms predict the velocity linearly from :math:`a_t`; the input and the target of :math:`F`
-    have mean 0 and variance 1 at every time and for every source. If the moments have values given the
-    observation, the slope is :math:`Cov(u_t, a_t | o) / Var(a_t | o)` instead, and the unit of :math:`F` the
-    standard deviation, over all data, of what this line leaves. :math:`F = 0` is optimal if :math:`(a_0,
-    a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
-    Eq. 7), whose constants assume zero means and an independent source.
+    have mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal if
+    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et
+    al., 2022, Eq. 7), whose constants assume zero means and an independent source.
 
     Variance and scale are computed without subtractions, which would lose precision. With the source's
     standard deviation :math:`s_0`, the covariance :math:`c` of source and target, and the standard deviation
@@ -228,8 +184,8 @@ class PreconditionedNetwork(VelocityNetwork):
 
     Args:
         network: the network :math:`F`, or its ``config()``.
-        moments: the moments of the prior's source and the targets, or their ``config()``; by default those
-            of an independent standard normal source and target; loading a state dict replaces them.
+        moments: the moments of the prior's source and the targets; by default those of an independent
+            standard normal source and target; loading a state dict replaces them.
         trend: the trend of the resting action, or its ``config()``. It gives :math:`E[a_0 | o]` and
             :math:`E[a_1 | o]` in place of the means above; the moments are then those of the remainder.
         interpolant: the path of the loss, or its ``config()``; linear by default.
@@ -255,7 +211,7 @@ class PreconditionedNetwork(VelocityNetwork):
         self,
         network: VelocityNetwork | dict[str, Any],
         *,
-        moments: SourceMoments | dict[str, Any] | None = None,
+        moments: SourceMoments | None = None,
         trend: RestingTrend | dict[str, Any] | None = None,
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
@@ -276,9 +232,7 @@ class PreconditionedNetwork(VelocityNetwork):
                 "evaluate it: choose another interpolant"
             )
         shape = (network.prediction_length, network.action_dim)
-        if not isinstance(moments, SourceMoments):
-            moments = SourceMoments.identity(*shape, **(moments or {}))
-        self.moments = moments
+        self.moments = SourceMoments.identity(*shape) if moments is None else moments
         self.trend = RestingTrend.zero(**trend) if isinstance(trend, dict) else trend
         check_shape("a moment for the network's chunks", self.moments.covariance, shape)
         if self.trend is not None:
@@ -294,64 +248,38 @@ class PreconditionedNetwork(VelocityNetwork):
 
     def remainder(self, t: Tensor) -> Tensor:
         """Return the unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
-        coefficients = self.interpolant.coefficients(t[:, None, None])
-        if self.moments.conditional:
-            return self._linear(*coefficients)[2]
-        # Every training step asks for it, and the slope would take as long again.
-        return _deviations(self._moments(), *coefficients)[1]
+        return self._deviations(*self.interpolant.coefficients(t[:, None, None]))[1]
 
-    def _moments(self, prefix: str = "") -> list[Tensor]:
-        return [getattr(self.moments, prefix + name) for name in (*_SECOND, "conditional_deviation")]
-
-    def _linear(self, *coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the slope of the velocity, one over the point's deviation, and the unit of ``F``.
-
-        The unit has two parts: what the best slope over all data leaves, and what the chosen one adds.
-        """
-        moments = self._moments()
-        scale, unit = _deviations(moments, *coefficients)
-        best = _slope(moments, scale, *coefficients)
-        if not self.moments.conditional:
-            return best, scale, unit
-        given = self._moments("given_")
-        slope = _slope(given, _deviations(given, *coefficients)[0], *coefficients)
-        return slope, scale, torch.hypot(unit, (best - slope) / scale)
+    def _deviations(
+        self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return one over the point's deviation, and the unit of ``F``."""
+        moments = self.moments
+        s0, q = moments.source_variance.sqrt(), moments.conditional_deviation
+        # a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
+        along, across = _combination(s0, alpha, moments.covariance / s0, beta), beta * q
+        scale = torch.addcmul(along * along, across, across).rsqrt()
+        return scale, (alpha * d_beta - d_alpha * beta).abs() * (s0 * q) * scale
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""
         self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
-        m0, m1 = self.moments.source_mean, self.moments.target_mean
+        moments = self.moments
+        m0, m1 = moments.source_mean, moments.target_mean
         if self.trend is not None:
             source, target = self.trend(observation)
             m0, m1 = m0 + source, m1 + target
-        slope, scale, unit = self._linear(alpha, beta, d_alpha, d_beta)
+        scale, unit = self._deviations(alpha, beta, d_alpha, d_beta)
+        covariance = _combination(
+            moments.source_variance, alpha * d_alpha, moments.target_variance, beta * d_beta
+        )
+        covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, moments.covariance)
+        slope = covariance * scale * scale
         centred = torch.addcmul(torch.addcmul(a, alpha, m0, value=-1), beta, m1, value=-1)
         learnt = self.network(t, centred * scale, observation)
         velocity = torch.addcmul(slope * centred, unit, learnt)
         return velocity + _combination(m0, d_alpha, m1, d_beta)
-
-
-def _deviations(
-    moments: Sequence[Tensor], alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return one over the point's deviation, and the deviation that the best slope leaves."""
-    v0, _, c, q = moments
-    s0 = v0.sqrt()
-    # a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
-    along, across = _combination(s0, alpha, c / s0, beta), beta * q
-    scale = torch.addcmul(along * along, across, across).rsqrt()
-    return scale, (alpha * d_beta - d_alpha * beta).abs() * (s0 * q) * scale
-
-
-def _slope(
-    moments: Sequence[Tensor], scale: Tensor, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor
-) -> Tensor:
-    """Return the best slope of the velocity, from one over the point's deviation."""
-    v0, v1, c, _ = moments
-    covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
-    covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
-    return covariance * scale * scale
 
 
 def _combination(x: Tensor, x_weight: Tensor, y: Tensor, y_weight: Tensor) -> Tensor:

@@ -20,8 +20,6 @@ Network = Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"]
 
 TRANSFORMERS = ("chi_transformer", "adaln_transformer")
 
-Slope = Literal["marginal", "conditional"]
-
 Encoder = Literal["resnet18-imagenet", "resnet18", "small"]
 
 PRETRAINED = "resnet18-imagenet"
@@ -40,8 +38,6 @@ class NetworkOptions:
             your own, with options as in package.module:Class,width=64.
         hidden_dim: width of a network that a name above stands for; the class's own by default.
         precondition: use the second moments of source and data, see PreconditionedNetwork.
-        slope: slope of preconditioning's linear part: over all data (marginal), or given the observation
-            (conditional).
         observation_steps: To, observations per decision.
         observation_layers: transformers only; hidden layers of the network that reads all To observations
             together; by default 1 in adaln_transformer, and 0 in chi_transformer, which embeds each alone.
@@ -62,7 +58,6 @@ class NetworkOptions:
     network: Network | str = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
-    slope: Slope = "marginal"
     observation_steps: int = 2
     observation_layers: int | None = None
     time_frequency: float | None = None
@@ -76,9 +71,6 @@ class NetworkOptions:
         if not self.is_own:
             check_choice("network", self.network, get_args(Network))
         check_choice("encoder", self.encoder, get_args(Encoder))
-        check_choice("slope", self.slope, get_args(Slope))
-        if self.slope != "marginal" and not self.precondition:
-            raise ValueError(f"slope = {self.slope!r} belongs to a preconditioned network")
         check_whole_numbers(0, **given(observation_layers=self.observation_layers))
         check_positive(**given(time_frequency=self.time_frequency))
         for name in self.of_transformers:

@@ -26,7 +26,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import RestingAction, RestingJoints, RestingTrend
 from warmprior.objectives.couplings import Coupling
-from warmprior.options.training import NetworkOptions, Slope, TrainingConfig
+from warmprior.options.training import NetworkOptions, TrainingConfig
 from warmprior.saving.policies import load_policy
 from warmprior.tasks.task import Task
 from warmprior.training.cloning import BehaviourCloning
@@ -67,7 +67,6 @@ def new_policy(
             coupling=coupling,
             withhold=training.cold_probability,
             rest=copy.deepcopy(task.rest),
-            slope=network.slope,
         )
     return WarmPriorActor(
         velocity,
@@ -254,7 +253,6 @@ def precondition(
     coupling: Coupling | None = None,
     withhold: float = 0.0,
     rest: RestingAction | None = None,
-    slope: Slope = "marginal",
 ) -> PreconditionedNetwork:
     """Wrap a network in a :class:`~warmprior.PreconditionedNetwork` for a prior and demonstrations.
 
@@ -270,7 +268,6 @@ def precondition(
             ``interpolant``, if it has one, or linear.
         withhold: share of the windows whose history is withheld.
         rest: the resting action, for absolute actions; the network then learns the motion from there.
-        slope: slope of the linear part, see :meth:`SourceMoments.fit`.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
@@ -296,8 +293,6 @@ def precondition(
     if rest is not None:
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
         trend = RestingTrend.fit(batch, prior, rest, generator=generator)
-    moments = SourceMoments.fit(
-        windows, prior, coupling=coupling, trend=trend, slope=slope, generator=generator
-    )
+    moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
     path = getattr(coupling, "interpolant", None)
     return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=path)
