@@ -65,48 +65,32 @@ print(*set(sys.modules) - before)
 for name in [name for name in sys.modules if name.split(".")[0] == "warmprior"]:
     del sys.modules[name]
 """
-LOCKED = """
-import pathlib
-sys.modules["fcntl"] = None
-import warmprior.training
-from warmprior.io.files import exclusive
-with exclusive(pathlib.Path({folder!r})):
-    print("inside")
-"""
 
 
 @pytest.fixture(scope="module")
-def fresh(tmp_path_factory):
-    """A folder, and what a process says: it imports the package, then again without other packages and locks.
+def fresh():
+    """What a process says: it imports the package, then again without other packages.
 
     PyTorch, whose import takes seconds, is imported once.
     """
-    folder = str(tmp_path_factory.mktemp("fresh") / "new")
-    done = ran(LOADED + BLOCK.format(names=OPTIONAL) + LOCKED.format(folder=folder) + TRAINED)
-    return folder, done
+    return ran(LOADED + BLOCK.format(names=OPTIONAL) + TRAINED)
 
 
 def test_optional_packages_are_not_imported_and_a_policy_trains_without_them(fresh):
     """Of the former those that TorchRL does not import itself where they are installed."""
-    loaded, *_, trained = fresh[1].stdout.splitlines()
+    loaded, *_, trained = fresh.stdout.splitlines()
     heavy = {"robosuite", "lerobot", "h5py", "matplotlib", "numba", "tyro"}
     assert "warmprior" in loaded.split() and not heavy & set(loaded.split())
     assert trained == "torch.Size([8, 4, 2])"
 
 
 def test_training_loads_neither_simulator_nor_renderer_nor_experts(fresh):
-    new = set(fresh[1].stdout.splitlines()[1].split())
+    new = set(fresh.stdout.splitlines()[1].split())
     assert "warmprior.training.train" in new
     heavy = {"robosuite", "mujoco", "OpenGL", "numba", "h5py", "lerobot", "loky", "matplotlib", "tyro"}
     assert not {name.split(".")[0] for name in new} & {*heavy, "lab", "benchmarks"}
     rooms = {".".join(name.split(".")[:2]) for name in new}
     assert not rooms & {"warmprior.envs", "warmprior.data", "warmprior.lerobot", "warmprior.deploy"}
-
-
-def test_folders_are_used_without_locks_where_the_system_has_none(fresh):
-    folder, done = fresh
-    assert done.stdout.splitlines()[2] == "inside"
-    assert folder in done.stderr and "one process" in done.stderr
 
 
 ROOMS = [

@@ -207,3 +207,17 @@ def test_a_log_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(logger, "log_scalar", full)
     training = BehaviourCloning(actor(), steps(), CONFIG, tmp_path / "run", logger=logger)
     refuses(lambda: training.run(None), OSError, "log", "logs")
+
+
+def test_a_logger_may_have_no_folder(tmp_path):
+    logger = CSVLogger("run", log_dir=str(tmp_path / "logs"))
+    logger.log_dir = None  # as that of Weights & Biases
+    BehaviourCloning(actor(), steps(), CONFIG, tmp_path / "run", logger=logger).run(None)
+    assert (tmp_path / "run" / "state.safetensors").exists()
+
+
+def test_a_run_of_another_version_is_named(tmp_path, monkeypatch):
+    with monkeypatch.context() as before:
+        before.setattr("warmprior.saving.training_state.STATE_FORMAT", 0)
+        BehaviourCloning(actor(), steps(), CONFIG, tmp_path).run(None)
+    refuses(lambda: BehaviourCloning(actor(), steps(), CONFIG, tmp_path), ValueError, "another version")

@@ -19,7 +19,7 @@ from warmprior.io.option_help import deferred, registry
 from warmprior.io.script import read_command_line, run_script
 from warmprior.options.agent import IMPROVE, NUM_ENVS, Algorithm
 from warmprior.options.data import PLACES
-from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.defaults import EVALUATION_SEED
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS, SourceOptions
 from warmprior.options.train_command import Data, Evaluation, Run
 from warmprior.options.training import NetworkOptions, TrainingConfig

@@ -159,8 +159,7 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
         shapes = f"{tuple(before.shape)}, {tuple(steps.shape)} and {tuple(target.shape)}"
         raise ValueError(f"need shapes [*B, H, d_a], [*B, 1] and [*B, P, d_a], got {shapes}")
     forecast = torch.zeros_like(target)
-    if ahead:
-        forecast[..., :ahead, :] = target[..., :ahead, :]
+    forecast[..., :ahead, :] = target[..., :ahead, :]
     steps = steps.clamp_max(before.shape[-2])
     return _history(batch_size, before, steps, forecast, torch.full_like(steps, ahead))
 

@@ -84,13 +84,11 @@ def sentences() -> dict[str, list[str]]:
     rates = {setting: whole(mean) for setting, mean in board["mean"].items()}
     few = [gain(GROUPS[name], s, 1) for name in (TEN, TWENTY_FIVE) for s in (PAST, PREVIEW)]
     short = [-gain(SHORT, s, 1) for s in (PAST, PREVIEW)]
+    long, correlated_long = (all_lengths(source, CHOICES["long training"]) for source in (PAST, CORRELATED))
     long_rates, default_rates = (
-        [
-            spaced(comparison.rates[k] for comparison in all_lengths(source, CHOICES["long training"]))
-            for k in (0, 1)
-        ]
-        for source in (PAST, CORRELATED)
+        [spaced(c.rates[k] for c in of) for k in (0, 1)] for of in (long, correlated_long)
     )
+    default_chances = ", ".join(comparison.chance for comparison in correlated_long)
     lengths = read_cells((SHORT[-1], LONG[-1]), common_seeds=True).query("nfe == 1")
     transport = [
         whole(lengths[(lengths["run"] == runs[-1]) & (lengths["source"] == s)]["success"].mean())
@@ -126,7 +124,7 @@ def sentences() -> dict[str, list[str]]:
             f"{span(few)} points more with WP-Past and WP-Preview ({past_once.chance} for the largest gain)",
             f"{span(short)} points less at NFE 1 after short training",
             f"with WP-Past**: {long_rates[0]}% against {long_rates[1]}%",
-            f"after 80,000 iterations**: {default_rates[0]}% against {default_rates[1]}%",
+            f"after 80,000 iterations**: {default_rates[0]}% against {default_rates[1]}% ({default_chances})",
             f"(the decoder of a CVAE) solves {rates[CVAE, 9]}% of episodes at NFE 9 ({learned[9].chance} "
             "against the Gaussian source)",
             f"MIP (a regression) {rates['mip', 2]}% at NFE 2 ({mip.chance})",

@@ -22,7 +22,7 @@ from lab.options.stored_options import from_record, recorded, stored_options
 from lab.reporting.report import unlike
 from tests.benchmarks.script_parts import refused
 from tests.errors import raises
-from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.defaults import EVALUATION_SEED
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [

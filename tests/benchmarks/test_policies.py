@@ -24,7 +24,7 @@ from warmprior import RealTimeChunking, VelocityNetwork, policy_transforms
 from warmprior.diagnostics import smoothness
 from warmprior.evaluation import play_episode
 from warmprior.io.distributed import rank, world_size
-from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.defaults import EVALUATION_SEED
 
 
 def untimed(out):

@@ -75,7 +75,17 @@ class Scripted(TensorDictModuleBase):
 
 def running(policy, prior, **options):
     """An executor of a scripted policy that sees one observation."""
-    return AsyncExecutor(policy, prior=prior, action_dim=2, **{"observation_steps": 1} | options)
+    policy.prior, policy.action_dim = prior, 2
+    policy.observation_steps = options.pop("observation_steps", 1)
+    return AsyncExecutor(policy, **options)
+
+
+def test_a_module_of_ones_own_may_have_a_network_that_tells_nothing():
+    policy = Scripted(4)
+    policy.network = torch.nn.Linear(1, 1)
+    with running(policy, GaussianPrior(4), latency=0, observation_steps=3) as executor:
+        assert executor.act(torch.zeros(1)).shape == (2,)
+    assert policy.given[0]["observation"].shape == (3, 1)
 
 
 class FakeClock(Executor):
@@ -114,11 +124,12 @@ def drive(executor, clock, ticks):
     return torch.stack(actions)
 
 
-def test_measured_delays_on_a_fake_clock():
+def test_measured_delays_on_a_fake_clock(monkeypatch):
     """P = 12, H = 6: decisions every 4 steps, or as soon as the last one took effect."""
     durations = [2, 1, 5, 1, 1, 1, 1]
     clock, policy = FakeClock(durations), Scripted(12)
-    executor = running(policy, PreviewPrior(6), execute=4, delay=1, window=3)
+    monkeypatch.setattr("warmprior.deploy.executor.RECENT", 3)
+    executor = running(policy, PreviewPrior(6), execute=4, delay=1)
     executor._thread = clock
     actions = drive(executor, clock, 31)
     # Every action is the one for the step at which it is executed, whoever is late.
@@ -314,6 +325,7 @@ def test_chunks_that_no_robot_should_get():
         *(({"execute": 6, "delay": 3}, (8, 6, 3, 5)), ({"latency": 5}, (5, 8, 4))),
         *(({"latency": 1.5}, ("latency", 1.5)), ({"execute": 2.5}, ("execute", 2.5))),
         ({"prior": None}, ("Scripted", "prior", "action_dim")),
+        ({"observation_steps": 0}, ("observation_steps", 0)),
         *(
             ({"delay": 0.06}, (0.06, "control_rate")),
             ({"delay": float("nan"), "control_rate": 20}, ("delay",)),

@@ -159,7 +159,8 @@ def test_an_entry_that_is_none_is_not_said_to_be_there():
 
 def test_drivers_reuse_their_memory():
     policy, memory = Scripted(8), np.zeros(1)
-    with AsyncExecutor(policy, prior=PastPrior(8), action_dim=2, latency=0, execute=1) as executor:
+    policy.prior, policy.action_dim = PastPrior(8), 2
+    with AsyncExecutor(policy, latency=0, execute=1) as executor:
         for tick in range(3):
             memory[:] = tick
             executor.act(memory)

@@ -189,7 +189,7 @@ def test_options_and_delays_that_cannot_be():
     with raises(ValueError, "execution_horizon=2", "delay", 3):
         RealTimeChunking(execution_horizon=2).guided(network(), y, left, delay)
     for wrong in ((left[:2], delay), (left, delay.squeeze(1))):
-        with raises(ValueError, "forecast_steps", "delay", "[B, 1]"):
+        with raises(ValueError, "has shape", 3, 1):
             RealTimeChunking().guided(network(), y, *wrong)
 
 

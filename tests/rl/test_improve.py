@@ -1,6 +1,5 @@
 """A saved policy is improved, the better policy is kept, and nothing is lost at an interruption."""
 
-import json
 from functools import partial
 from types import SimpleNamespace
 
@@ -158,8 +157,8 @@ def test_a_policy_of_gymnasium_is_improved_by_its_success(tmp_path, monkeypatch)
     for policy, solved in ((actor, result.before), (result.policy, result.after)):
         played = evaluate(policy, env, episodes=4, first_seed=10_000_000)
         assert sum(episode.success for episode in played) == solved
-    stored, _ = load_state(tmp_path / "buffer" / "000000.safetensors", "transitions", "")
-    reward, executed = (stored[json.dumps(["next", name])] for name in ("reward", "executed_steps"))
+    stored, _ = load_state(tmp_path / "state.safetensors")
+    reward, executed = (stored[f'buffer/["next", "{name}"]'] for name in ("reward", "executed_steps"))
     assert set((reward + executed).flatten().tolist()) == {0.0, 1.0}  # the dial's own rewards are 1 a step
 
 

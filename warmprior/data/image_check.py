@@ -54,7 +54,7 @@ class StateRenderer:
         store_finite(states, states, what, "Leave the demo out.")  # MuJoCo would render NaN without an error
         return states[:, 1 : 1 + model.nq]
 
-    def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], advice: str) -> None:
+    def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray]) -> None:
         """Compare images of a state, by camera, with the simulator's."""
         name = self.index.path
         (joints,) = self.joints(state[None], 1, f"{name}: the first state")
@@ -73,7 +73,7 @@ class StateRenderer:
             if other or as_stored > CLEARLY:
                 view = view if other else next(iter(views))
                 raise DatasetError(
-                    f"{name}: images of {camera} {view} ({as_stored:.0f} of 255 off): {advice}"
+                    f"{name}: images of {camera} {view} ({as_stored:.0f} of 255 off): render these again"
                 )
 
 
@@ -95,7 +95,7 @@ def check_images(demonstrations: Demonstrations, index: DatasetIndex, fast: bool
         try:
             for size in {*index.image_shapes}:
                 stored = {camera: image for camera, image in images.items() if image.shape[:2] == size}
-                StateRenderer(index, size, fast).compare(state, stored, "render these again")
+                StateRenderer(index, size, fast).compare(state, stored)
             return
         except ImportError as error:  # policies are often trained where nothing renders
             why = str(error)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import (
@@ -20,6 +21,7 @@ from warmprior.checks import (
 )
 from warmprior.data.checks import DatasetError
 from warmprior.envs.robosuite_tasks import TaskSpec
+from warmprior.keys import OBSERVATION, STATE
 from warmprior.options.data import Resize
 
 BLOCK = 4096  # rows handled at once, to bound temporary memory for demos of any length
@@ -92,6 +94,11 @@ class DatasetIndex:
         for key in sorted(set(self.available_keys) - {*self.observation_keys, *self.image_keys}):
             others.setdefault(self.taken_by.get(key, "observations"), []).append(key)
         return others
+
+    @property
+    def vector_key(self) -> NestedKey:
+        """The key of the steps' vector, beside which images are."""
+        return (OBSERVATION, STATE) if self.image_keys else OBSERVATION
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior.checks import check_choice
@@ -20,7 +19,7 @@ from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions
 from warmprior.io.machine import available_memory
-from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
+from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION
 from warmprior.rotation import matrix_to_rotation_6d, rotvec_to_matrix
 
 Storage = Literal["memory", "memmap"]
@@ -109,7 +108,7 @@ def _allocate(index: DatasetIndex, action_dim: int, images: Sequence[str]) -> Te
     vector = (torch.float32, (sum(index.observation_dims),))
     image = (torch.uint8, image_shape(index)[1:])
     widths = {
-        _vector_key(index): vector,
+        index.vector_key: vector,
         **{(OBSERVATION, key): image for key in images},
         ACTION: (torch.float32, (action_dim,)),
         ("next", "reward"): (torch.float32, (1,)),
@@ -129,10 +128,6 @@ def _allocate(index: DatasetIndex, action_dim: int, images: Sequence[str]) -> Te
             f"free: use {advice}fewer demos"
         )
     return torch.empty_like(data)
-
-
-def _vector_key(index: DatasetIndex) -> NestedKey:
-    return (OBSERVATION, STATE) if index.image_keys else OBSERVATION
 
 
 def _read_poses(reader: DemonstrationReader, demo: str, out: np.ndarray) -> None:
@@ -216,7 +211,7 @@ def _fill(
     reader: DemonstrationReader,
     read_actions: Callable[[str, np.ndarray], None],
 ) -> None:
-    observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
+    observation, action = data[index.vector_key].numpy(), data[ACTION].numpy()
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])

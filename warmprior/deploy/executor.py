@@ -33,10 +33,12 @@ from warmprior.history import caught_up, cold_history
 from warmprior.modules.actor import check_usual_keys
 from warmprior.modules.network import device_of, uncompiled
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import spliced
 from warmprior.transforms.delay import check_delay, usual_execute
 from warmprior.transforms.history import HistoryObservation
+
+RECENT = 10
+"""The number of recent delays, of which the largest is expected."""
 
 
 class AsyncExecutor:
@@ -65,26 +67,23 @@ class AsyncExecutor:
         actor: a :class:`~warmprior.WarmPriorActor`, an :class:`ExportedPolicy`, a
             :class:`~warmprior.lerobot.LeRobotActor`, or any module
             that reads ``"observation"`` (or ``("prior", "observation")``, which includes the last actions),
-            ``"history"`` and ``("rtc", "delay")`` and writes a chunk ``[P, d_a]``. It is set to evaluation
-            mode, and called without batch dimensions.
-        prior: the policy's prior (only its lengths are used); the actor's own by default.
+            ``"history"`` and ``("rtc", "delay")``, writes a chunk ``[P, d_a]``, and has the attributes
+            ``prior`` (only its lengths are used), ``action_dim`` and ``observation_steps`` (2 without it). It
+            is set to evaluation mode, and called without batch dimensions.
         execute: control steps between decisions; by default ``H`` (of a LeRobot policy its
             ``n_action_steps``), or as many as ``delay`` allows.
         delay: expected delay before any is measured, in control steps, or in seconds with ``control_rate``;
             one control step by default.
         control_rate: control steps per second: those of the demonstrations, if the policy knows them.
-        window: the expected delay is the largest of this many recent ones.
-        observation_steps: ``To``; that of the actor's network by default, or 2.
         normalizer: converts raw observations and actions; the actor's own by default. Without one
             (``actor.replace(normalizer=None)``), both are in the policy's units.
         timeout: seconds to wait for a late chunk once no action is left; ``None`` waits without limit.
         latency: simulated delay: chunks are computed in the calling thread and take effect this many control
             steps later.
-        action_dim: ``d_a``; that of the actor's network by default.
 
     Raises:
-        ValueError: if numbers are inconsistent, an argument is missing that the actor does not provide, the
-            actor has keys of its own, or the normaliser lacks observations or actions.
+        ValueError: if numbers are inconsistent, the actor lacks an attribute or has keys of its own, or the
+            normaliser lacks observations or actions.
 
     Examples:
         >>> import torch
@@ -101,29 +100,23 @@ class AsyncExecutor:
         self,
         actor: TensorDictModuleBase,
         *,
-        prior: Prior | None = None,
         execute: int | None = None,
         delay: float | None = None,
         control_rate: float | None = None,
-        window: int = 10,
-        observation_steps: int | None = None,
         normalizer: Normalizer | None = None,
         timeout: float | None = 0.0,
         latency: int | None = None,
-        action_dim: int | None = None,
     ) -> None:
         plain = uncompiled(actor)
-        network = uncompiled(getattr(plain, "network", plain))
-        prior = getattr(plain, "prior", None) if prior is None else prior
+        network = uncompiled(getattr(plain, "network", None))
+        prior = getattr(plain, "prior", None)
+        action_dim = getattr(plain, "action_dim", getattr(network, "action_dim", None))
+        observation_steps: int = getattr(plain, "observation_steps", getattr(network, "observation_steps", 2))
         normalizer = getattr(plain, "normalizer", None) if normalizer is None else normalizer
-        if action_dim is None:
-            action_dim = getattr(network, "action_dim", None)
-        if observation_steps is None:
-            observation_steps = getattr(network, "observation_steps", 2)
         check_usual_keys(actor, "AsyncExecutor")
         if prior is None or action_dim is None:
-            raise ValueError(f"{type(actor).__name__} needs prior and action_dim")
-        check_whole_numbers(window=window, observation_steps=observation_steps, **given(execute=execute))
+            raise ValueError(f"{type(actor).__name__} needs the attributes prior and action_dim")
+        check_whole_numbers(observation_steps=observation_steps, **given(execute=execute))
         check_whole_numbers(0, **given(latency=latency))
         check_not_negative(**given(timeout=timeout))
         check_positive(**given(control_rate=control_rate))
@@ -154,7 +147,7 @@ class AsyncExecutor:
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._postprocess = getattr(plain, "postprocess", None)
         self._observed = RobotObservation(
-            observation_shapes(actor, prior),
+            observation_shapes(actor),
             self._normalizer,
             getattr(encoder_in(actor), "resize", "squeeze"),
             recording,
@@ -164,7 +157,7 @@ class AsyncExecutor:
         if latency is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
         self._expected = expected
-        self._delays: deque[int] = deque(maxlen=window)
+        self._delays: deque[int] = deque(maxlen=RECENT)
         self._stacked = observation_steps
         self._frames: deque[Tensor | TensorDictBase] = deque(maxlen=observation_steps)
         self._lock = RLock()

@@ -18,7 +18,6 @@ from warmprior.checks import check_keys, check_shape
 from warmprior.modules.encoder import ImageEncoder
 from warmprior.modules.network import VelocityNetwork, uncompiled
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.prior import Prior
 from warmprior.modules.recording import Recording
 from warmprior.modules.resize import resized
 from warmprior.options.data import Resize
@@ -35,14 +34,10 @@ def encoder_in(actor: Any) -> ImageEncoder | None:
     return next((part for part in modules if isinstance(part, ImageEncoder)), None)
 
 
-def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, tuple[int, ...]] | None:
+def observation_shapes(actor: Any) -> Mapping[str, tuple[int, ...]] | None:
     """Return the shapes of a policy's observation at one step, by name, or ``None`` if they are unknown.
 
     Vectors are ``(d,)``, and images ``(3, h, w)`` at the size of the training images.
-
-    Args:
-        actor: the policy.
-        prior: its source; by default ``actor.prior``.
     """
     plain = uncompiled(actor)
     network = uncompiled(getattr(plain, "network", None))
@@ -53,8 +48,7 @@ def observation_shapes(actor: Any, prior: Prior | None = None) -> Mapping[str, t
         return None
     shapes = {keys.STATE: (network.observation_dim,)} if encoder is None else {**encoder.shapes}
     if keys.CONDITIONED in actor.in_keys and keys.STATE in shapes:
-        prior = plain.prior if prior is None else prior
-        added = HistoryObservation.width(prior.history_length, network.action_dim)
+        added = HistoryObservation.width(plain.prior.history_length, network.action_dim)
         shapes[keys.STATE] = (shapes[keys.STATE][0] - added,)
     return shapes
 

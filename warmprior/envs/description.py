@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, get_args
 
@@ -164,21 +164,19 @@ def registered_description(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_registered(description: Any) -> bool:
     """Return True if a description has the form of :func:`registered_description`."""
-    try:
-        return description.keys() == {"gymnasium"} and description["gymnasium"].keys() == _REGISTERED
-    except AttributeError:
-        return False
+    return _has(description, {"gymnasium"}) and _has(description["gymnasium"], _REGISTERED)
 
 
 def _is_complete(description: Any) -> bool:
     """Return True if a description has only the entries of :func:`environment_description`."""
-    try:
-        images = description.get("images", dict.fromkeys(_IMAGES))
-        return (
-            description.keys() - {"actions", "images"} == {"robosuite"}
-            and description["robosuite"].keys() - {"low_dim_keys", "horizon"} == {"env_args", "style"}
-            and description.get("actions", "delta") in get_args(Actions)
-            and images.keys() == set(_IMAGES)
-        )
-    except AttributeError:  # no description, or the user's own
-        return False
+    return (
+        _has(description, {"robosuite"}, {"actions", "images"})
+        and _has(description["robosuite"], {"env_args", "style"}, {"low_dim_keys", "horizon"})
+        and description.get("actions", "delta") in get_args(Actions)
+        and ("images" not in description or _has(description["images"], set(_IMAGES)))
+    )
+
+
+def _has(entry: Any, needed: set[str], optional: Iterable[str] = ()) -> bool:
+    """Return True if a part of a description has the needed entries, and no others than the optional ones."""
+    return isinstance(entry, Mapping) and entry.keys() - set(optional) == needed

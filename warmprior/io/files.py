@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import os
 import platform
 import re
-import sys
 import tempfile
 import time
 import uuid
@@ -232,12 +232,6 @@ def exclusive(directory: Path) -> Iterator[None]:
         BlockingIOError: ... is in use by another process: wait, or choose another
     """
     directory.mkdir(parents=True, exist_ok=True)
-    try:
-        import fcntl
-    except ImportError:
-        warnings.warn(f"{directory} cannot be locked on {sys.platform}: use it in one process", stacklevel=3)
-        yield
-        return
     folder = os.open(directory, os.O_RDONLY)
     try:
         try:

@@ -265,11 +265,8 @@ class VisionNetwork(VelocityNetwork):
             encoder = ImageEncoder(**encoder)
         if isinstance(network, dict):
             network = from_config(VelocityNetwork, network)
-        if network.observation_dim != encoder.observation_dim:
-            raise ValueError(
-                f"the network was built for observation_dim={network.observation_dim}, but the encoder "
-                f"gives {encoder.observation_dim}"
-            )
+        if (read := network.observation_dim) != (made := encoder.observation_dim):
+            raise ValueError(f"the network has observation_dim={read}, but the encoder {made}")
         super().__init__(
             network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
         )

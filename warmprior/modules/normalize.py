@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import torch
@@ -182,22 +182,20 @@ class Normalizer(RawUnits):
 
     def normalize(self, data: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy in which the keys that are present are normalised."""
+        return self._mapped(data, lambda value, loc, scale: (value - loc) / scale)
+
+    def denormalize(self, data: TensorDictBase) -> TensorDictBase:
+        """Return a shallow copy in which the keys that are present are in raw units again."""
+        return self._mapped(data, lambda value, loc, scale: value * scale + loc)
+
+    def _mapped(self, data: TensorDictBase, affine: Callable[..., Tensor]) -> TensorDictBase:
         data = data.clone(False)
         for key in self.keys:
             value, loc = data.get(key, None), self.loc(key)
             if value is not None:
                 check_width(key, value.shape, loc)
                 value = value if value.is_floating_point() else value.to(loc.dtype)
-                data.set(key, (value - loc) / self.scale(key))
-        return data
-
-    def denormalize(self, data: TensorDictBase) -> TensorDictBase:
-        """Return a shallow copy in which the keys that are present are in raw units again."""
-        data = data.clone(False)
-        for key in self.keys:
-            if (value := data.get(key, None)) is not None:
-                check_width(key, value.shape, self.loc(key))
-                data.set(key, value * self.scale(key) + self.loc(key))
+                data.set(key, affine(value, loc, self.scale(key)))
         return data
 
     def config(self) -> dict[str, Any]:

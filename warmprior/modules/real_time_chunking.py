@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from warmprior.checks import check_shape
 from warmprior.options.guidance import GuidanceOptions, Schedule
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
@@ -122,11 +123,8 @@ class RealTimeChunking(GuidanceOptions):
             RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
         """
         rows, length = forecast.shape[:2]
-        if not forecast_steps.shape == delay.shape == (rows, 1):
-            raise ValueError(
-                f"the forecast [B, P, d_a] has shape {tuple(forecast.shape)}: forecast_steps and delay have "
-                f"to be [B, 1], got {tuple(forecast_steps.shape)} and {tuple(delay.shape)}"
-            )
+        check_shape("forecast_steps", forecast_steps, (rows, 1))
+        check_shape("delay", delay, (rows, 1))
         steps, delay = forecast_steps.squeeze(1), delay.squeeze(1)
         if not steps.any():
             return velocity

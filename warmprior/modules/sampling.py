@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from warmprior.checks import check_choice, check_not_negative, check_positive, check_whole_numbers, given
-from warmprior.options.evaluation import DEFAULT_NFE
+from warmprior.options.defaults import DEFAULT_NFE
 
 JUMP = 0.5
 """The end of the dense steps of ``dense-jump``; Chen et al. saw fields pull to training actions after it."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warmprior.options.data import Actions, Resizing
-from warmprior.options.evaluation import DEFAULT_NFE
+from warmprior.options.defaults import DEFAULT_NFE
 
 
 @dataclass(frozen=True)

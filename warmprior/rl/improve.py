@@ -118,7 +118,7 @@ def improve_policy(
     """
     # Only here, because the package is imported without its environments.
     from warmprior.envs.description import environment_parts, is_registered
-    from warmprior.options.evaluation import EVALUATION_SEED
+    from warmprior.options.defaults import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     check_improvable(policy)

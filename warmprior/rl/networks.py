@@ -112,10 +112,8 @@ class _Trunk(nn.Module):
         scaled = zip(inputs, self.scales, strict=True)
         x = torch.cat([value.flatten(-2).to(dtype) * scale for value, scale in scaled], dim=-1)
         if x.shape[-1] != self.in_features:
-            raise ValueError(
-                f"the network was built for {self.in_features} inputs, got the shapes "
-                f"{[tuple(value.shape) for value in inputs]}"
-            )
+            shapes = [tuple(value.shape) for value in inputs]
+            raise ValueError(f"the network was built for {self.in_features} inputs, got the shapes {shapes}")
         return self.net(x)
 
 

@@ -33,62 +33,21 @@ from warmprior.rl.anchor import has_anchor
 from warmprior.rl.decoder import residual_reach
 from warmprior.rl.improved import improved_policy
 from warmprior.saving.training_state import (
+    STATE_FORMAT,
     RunState,
     as_key,
     digest_of_state,
-    load_state,
     named,
-    save_state,
     select,
 )
 from warmprior.transforms.chunk import ChunkStep
 
 
-class ReplaySegments:
-    """A folder of safetensors files, one per save, with the transitions since the last save.
-
-    A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
-    training state, the next process replaces that segment. In an existing folder ``segments`` are kept.
-    """
-
-    def __init__(self, directory: Path, segments: int = 0) -> None:
-        self.directory = directory
-        self.committed = segments
-        self._pending: list[TensorDictBase] = []
-
-    def _path(self, index: int) -> Path:
-        return self.directory / f"{index:06d}.safetensors"
-
-    def append(self, transitions: TensorDictBase) -> None:
-        """Remember transitions ``[n]`` for the next :meth:`write`."""
-        self._pending.append(transitions.cpu())
-
-    def write(self) -> None:
-        """Write the appended transitions, if any, as a new segment."""
-        if not self._pending:
-            return
-        data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
-        tensors = {json.dumps(key): value for key, value in data.items(True, True)}  # with any separator
-        save_state(self._path(self.committed), tensors, {})
-        self.committed += 1
-        self._pending.clear()
-
-    def load(self) -> TensorDict | None:
-        """Return all committed transitions ``[N]`` or ``None``; raise ValueError for a damaged segment."""
-        parts = []
-        for index in range(self.committed):
-            advice = "Restore it, or choose another output folder"
-            tensors, _ = load_state(self._path(index), "part of the replay buffer", advice)
-            values = {as_key(json.loads(name)): value for name, value in tensors.items()}
-            parts.append(TensorDict(values, [len(next(iter(values.values())))]))
-        return torch.cat(parts) if parts else None
-
-
 class PriorSpaceTraining:
     """A training of an agent around a frozen policy, with TorchRL's environments, losses and replay buffer.
 
-    The folder receives ``state.safetensors`` (replaced atomically at every evaluation) and the replay buffer
-    in segments. Constructing the same training on it continues from the last save. Simulators cannot be
+    The folder receives ``state.safetensors``, with the replay buffer, which every evaluation replaces
+    atomically. Constructing the same training on it continues from the last save. Simulators cannot be
     saved, so unfinished episodes are lost at an interruption.
 
     Args:
@@ -160,7 +119,6 @@ class PriorSpaceTraining:
             storage=LazyTensorStorage(config.environment_steps, device=self.device),
             batch_size=config.batch_size,
         )
-        self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
         self._best: dict[str, torch.Tensor] = {}
@@ -173,11 +131,13 @@ class PriorSpaceTraining:
             "evaluation_seed": evaluation_seed,
             "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
             "transitions": self._transition_keys,
+            "format": STATE_FORMAT,
         }
         self._state = RunState(self.directory, self.identity)
         #: The path of the training state.
         self.state_path = self._state.path
         self._restore()
+        self._compiles = compile
         if compile:
             self.agent.compile()
 
@@ -244,6 +204,9 @@ class PriorSpaceTraining:
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
+                    if self._compiles:
+                        bar.set_postfix_str("compiling the updates")
+                        self._compiles = False
                     with torch_threads(threads):
                         metrics = self.agent.learn(self.buffer)
                     last = {row["evaluation"]: row["success_rate"] for row in self.curve}
@@ -281,7 +244,12 @@ class PriorSpaceTraining:
     def _decisions(self, env: EnvBase) -> Iterator[TensorDictBase]:
         data = env.reset()
         while True:
-            decided, data = self._collect(env, data)
+            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+                data = self._switch(data.to(self.device)).to(env.device or torch.device("cpu"))
+            # Checked before a simulator executes them.
+            self._check_finite(data.select(keys.DELTA, keys.CHUNK))
+            with torch.no_grad():
+                decided, data = env.step_and_maybe_reset(data)
             yield decided
 
     def _collection_seed(self) -> int:
@@ -289,14 +257,6 @@ class PriorSpaceTraining:
         if self.steps:
             return 1_000_000_000 + 10_000_000 * (self.config.seed % 100) + self.steps % 10_000_000
         return 6_000_000 + 100_000 * (self.config.seed % 10)
-
-    @torch.no_grad()
-    def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        with set_exploration_type(ExplorationType.RANDOM):
-            data = self._switch(data.to(self.device)).to(env.device or torch.device("cpu"))
-        # Checked before a simulator executes them.
-        self._check_finite(data.select(keys.DELTA, keys.CHUNK))
-        return env.step_and_maybe_reset(data)
 
     def _store(self, data: TensorDictBase) -> int:
         """Add decisions to the replay buffer; return the number of their control steps."""
@@ -309,7 +269,6 @@ class PriorSpaceTraining:
         self._check_finite(transitions)
         self._check_executed(following)
         self.buffer.extend(transitions)
-        self.segments.append(transitions)
         return int(data["next", keys.EXECUTED].sum())
 
     def _check_finite(self, data: TensorDictBase) -> None:
@@ -370,20 +329,20 @@ class PriorSpaceTraining:
         tensors = {**self.agent.state(), **named("best", self._best), "rng": torch.get_rng_state()}
         if self.device.type == "cuda":
             tensors["rng_cuda"] = torch.cuda.get_rng_state(self.device)
-        self.segments.write()
-        facts = {"steps": self.steps, "curve": self.curve, "segments": self.segments.committed}
-        self._state.save(tensors, **facts)
+        if len(self.buffer):
+            transitions = self.buffer[:].items(True, True)
+            tensors |= named("buffer", {json.dumps(key): value for key, value in transitions})
+        self._state.save(tensors, steps=self.steps, curve=self.curve)
 
     def _restore(self) -> None:
         """Continue from the folder's state, if it has one that is not restored already."""
         self._state.restore(self._load)
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
-        self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
-        transitions = self.segments.load()
         self.buffer.empty()
-        if transitions is not None:
-            self.buffer.extend(transitions)
+        if stored := select("buffer", tensors):
+            transitions = {as_key(json.loads(name)): value for name, value in stored.items()}
+            self.buffer.extend(TensorDict(transitions, [len(transitions[keys.DELTA])]))
         self.agent.load(tensors)
         self._best = {name: value.to(self.device) for name, value in select("best", tensors).items()}
         self.steps, self.curve = facts["steps"], facts["curve"]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -106,6 +106,8 @@ class AnotherRunError(ValueError):
 def check_identity(path: Path, stored: Any, expected: Mapping[str, Any]) -> None:
     """Raise AnotherRunError, with what differs, if a state belongs to another run."""
     stored, expected = stored if isinstance(stored, dict) else {}, as_json(expected)
+    if stored.get("format") != expected.get("format"):
+        raise AnotherRunError(f"{path} was written by another version: remove it, or choose another folder")
     if any(stored.get(part) != value for part, value in expected.items()):
         raise AnotherRunError(
             f"{path} belongs to a run with other options ({differences(stored, expected)}): repeat its "
@@ -139,15 +141,11 @@ def differences(before: Any, now: Any) -> str:
 
 def _in_words(path: tuple[str, ...], old: Any, new: Any) -> str:
     part = " of ".join(reversed(path[:-1]))
-    if not _is_digest(old) or not _is_digest(new):
+    if not all(isinstance(value, str) and re.fullmatch("[0-9a-f]{16,}", value) for value in (old, new)):
         return f"{path[-1]} was {old} and is {new}"
     if path[-1] == "buffers":
         return f"the untrained values of {part}, such as statistics of the demonstrations, differ"
     return DIGESTS.get(path[-1], f"the {path[-1]} of {part} differs")
-
-
-def _is_digest(value: Any) -> bool:
-    return isinstance(value, str) and bool(re.fullmatch("[0-9a-f]{16,}", value))
 
 
 def _leaves(path: tuple[str, ...], before: Any, now: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
@@ -170,10 +168,8 @@ def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
 
 def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
     """Load :func:`snapshot_optimizer`'s tensors into an optimiser with the same parameters."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = value
+    slots = TensorDict(dict(tensors)).unflatten_keys(".").to_dict()
+    state = {int(position): values for position, values in slots.items()}
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
 
@@ -227,7 +223,7 @@ HASHED_AT_ONCE = 2**26
 """The bytes of data that are hashed at once."""
 
 
-STATE_FORMAT = 7
+STATE_FORMAT = 8
 """A version in every identity; it is raised whenever the same options lead to other weights."""
 
 

@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
-
-from tensordict.utils import NestedKey
-from torch import Tensor
-from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Transform
 
 from warmprior.checks import given
 from warmprior.data.demonstrations import Demonstrations
@@ -21,36 +15,7 @@ from warmprior.envs.gymnasium import registered_builder
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION
 from warmprior.options.data import Actions
-from warmprior.tasks.task import Play
-
-
-@dataclass(frozen=True)
-class RecordedEnvironment:
-    """The environment in which demonstrations were recorded, as policies play it.
-
-    Attributes:
-        index: the demonstrations, with the observations that policies see.
-        make_env: builds it.
-        description: the description that a saved policy keeps, see :func:`~warmprior.envs.environment_of`.
-        name: short name of the task.
-        style: style of the demonstrations.
-        adapters: transforms directly after it, as arguments of :func:`~warmprior.policy_transforms`.
-        units: raw sizes of one normalised unit, see :meth:`Normalizer.fit`.
-        poses: the columns of grippers' poses, if actions are absolute poses.
-        facts: facts about the data for results.
-        digest: digest of the data, if that of the values is not to be computed.
-    """
-
-    index: DatasetIndex
-    make_env: Callable[..., EnvBase]
-    description: Mapping[str, Any]
-    name: str
-    style: str
-    adapters: Mapping[str, Transform] = field(default_factory=dict)
-    units: Mapping[NestedKey, Tensor] | None = None
-    poses: Tensor | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    digest: str | None = None
+from warmprior.tasks.task import Play, RecordedEnvironment
 
 
 def _robosuite(
@@ -106,11 +71,11 @@ def _robosuite(
     space |= {} if observations is None else {"observation_keys": list(observations)}
     return RecordedEnvironment(
         index,
-        make_env,
-        description,
         index.task_name,
         style,
-        adapters=adapters,
+        make_env,
+        description,
+        adapters,
         units=None if absolute is None else {ACTION: absolute.one_step},
         poses=None if absolute is None else index.pose_columns,
         facts={"sha256": sha256, **space},
@@ -135,11 +100,11 @@ def _gymnasium(
     environment |= given(max_episode_steps=play.horizon)
     return RecordedEnvironment(
         index,
+        demonstrations.title,
+        demonstrations.style or "human",
         # Unknown wrappers raise an error only when it is built, which training does not need.
         registered_builder(environment),
         registered_description(environment),
-        demonstrations.title,
-        demonstrations.style or "human",
     )
 
 

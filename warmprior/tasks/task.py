@@ -32,6 +32,7 @@ from warmprior.transforms.policy import PolicyEnv, policy_transforms
 
 if TYPE_CHECKING:  # to import a task takes no reader
     from warmprior.data.demonstrations import Demonstrations
+    from warmprior.data.index import DatasetIndex
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,40 @@ class Play:
         own = {"success": self.success != SUCCESS, "measures": self.measures, "video_rate": self.video_rate}
         if self.make_env is None and (named := [name for name, value in own.items() if value]):
             raise ValueError(f"{', '.join(named)} of an environment of your own: pass its make_env as well")
+
+
+def _no_environment() -> EnvBase:
+    raise ValueError("these demonstrations have no environment: give Play a function that builds one")
+
+
+@dataclass(frozen=True)
+class RecordedEnvironment:
+    """What is known of the environment in which demonstrations were recorded.
+
+    Attributes:
+        index: the demonstrations, with the observations that policies see.
+        name: short name of the task.
+        style: style of the demonstrations.
+        make_env: builds it.
+        description: the description that a saved policy keeps, see :func:`~warmprior.envs.environment_of`;
+            ``None`` if it is unknown.
+        adapters: transforms directly after it, as arguments of :func:`~warmprior.policy_transforms`.
+        units: raw sizes of one normalised unit, see :meth:`Normalizer.fit`.
+        poses: the columns of grippers' poses, if actions are absolute poses.
+        facts: facts about the data for results.
+        digest: digest of the data, if that of the values is not to be computed.
+    """
+
+    index: DatasetIndex
+    name: str
+    style: str
+    make_env: Callable[..., EnvBase] = _no_environment
+    description: Mapping[str, Any] | None = None
+    adapters: Mapping[str, Transform] = field(default_factory=dict)
+    units: Mapping[NestedKey, Tensor] | None = None
+    poses: Tensor | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    digest: str | None = None
 
 
 class Task:
@@ -175,15 +210,19 @@ class Task:
             recorded = KINDS[kind](
                 demonstrations, index, environment, observations, images, actions=actions, play=play
             )
-        index = demonstrations.index(observations, images) if recorded is None else recorded.index
+        if recorded is None:
+            style = demonstrations.style or "human"
+            index = demonstrations.index(observations, images)
+            recorded = RecordedEnvironment(index, demonstrations.title, style)
+        index, self.environment = recorded.index, recorded.description
         if not index.image_keys and (demonstrations.image_size, demonstrations.resize) != (None, "squeeze"):
             raise ValueError("image_size and resize belong to images: name them, or leave both out")
-        is_robosuite = recorded is not None and index.env_args
+        is_robosuite = self.environment is not None and index.env_args
         others = {
             "actions": actions != "delta" and not is_robosuite,
             "fast_rendering": play.fast_rendering and not is_robosuite,
             "task": demonstrations.task is not None and not index.env_args,
-            "horizon": play.horizon is not None and recorded is None,
+            "horizon": play.horizon is not None and self.environment is None,
         }
         if unused := [name for name, given in others.items() if given]:
             known = "the demonstrations name none" if play.make_env is None else "make_env replaces it"
@@ -199,41 +238,29 @@ class Task:
         columns = index.joint_columns(targets) if isinstance(targets, str) and targets else [*targets]
         if index.image_keys:  # what takes long comes last
             steps = read(index.image_keys, storage="memmap")
-        vector: NestedKey = (OBSERVATION, STATE) if index.image_keys else OBSERVATION
-        self.resize = index.resize
-        self.name = demonstrations.title if recorded is None else recorded.name
-        self.style = (demonstrations.style or "human") if recorded is None else recorded.style
+        self.resize, self.name, self.style = index.resize, recorded.name, recorded.style
         for part in (self.name, self.style):
             if Path(part).name != part:
                 raise ValueError(f"name and style become parts of file names, which cannot hold {part!r}")
-        self.data = steps.select(OBSERVATION, ACTION, EPISODE)
+        self.data, vector = steps.select(OBSERVATION, ACTION, EPISODE), index.vector_key
         self.normalizer: Normalizer | None = None
         self.clip: float | Sequence[float] | None = None
         if not demonstrations.normalised:
-            units = None if recorded is None else recorded.units
             widths = zip(index.observation_keys, index.observation_dims, strict=True)
-            names = [f"{key} [{i}]" for key, width in widths for i in range(width)]
-            self.normalizer = Normalizer.fit(steps, (vector, ACTION), units=units, names={vector: names})
+            columns_of = {vector: [f"{key} [{i}]" for key, width in widths for i in range(width)]}
+            self.normalizer = Normalizer.fit(steps, (vector, ACTION), units=recorded.units, names=columns_of)
             self.data = self.normalizer.normalize(self.data)
             self.clip = bound_of(self.data[ACTION])
-        self.make_env: Callable[..., EnvBase] = play.make_env or _no_environment
-        self.adapters: Mapping[str, Transform] = {}
-        self.environment: Mapping[str, Any] | None = None
+        self.make_env = play.make_env or recorded.make_env
+        self.adapters, self.digest = recorded.adapters, recorded.digest
+        counts = {"demonstrations": len(index.demos), "steps": len(self.data)}
+        self.facts: dict[str, Any] = {**counts, **demonstrations.facts, **recorded.facts}
         self.rest: RestingAction | None = None
-        self.digest: str | None = None
-        self.facts: dict[str, Any] = {"demonstrations": len(index.demos), "steps": len(self.data)}
-        self.facts |= demonstrations.facts
-        if recorded is not None:
-            self.make_env, self.adapters = recorded.make_env, recorded.adapters
-            self.environment, self.digest = recorded.description, recorded.digest
-            self.facts |= recorded.facts
-            if recorded.poses is not None:
-                self.rest = RestingPose(recorded.poses, self.normalizer)
-        if columns:
-            self.rest = self._joints(columns, needed=joints is not None)
         words = AS_RECORDED if self.environment is None else ", as the recorded environment takes them"
-        if self.rest is not None:
-            words = f", absolute targets of {targets}" if columns else ", absolute poses"
+        if recorded.poses is not None:
+            self.rest, words = RestingPose(recorded.poses, self.normalizer), ", absolute poses"
+        if columns and (joint_targets := self._joints(columns, needed=joints is not None)):
+            self.rest, words = joint_targets, f", absolute targets of {targets}"
         observed = steps[vector].split(list(index.observation_dims), -1)
         parts = {**dict(zip(index.observation_keys, observed, strict=True)), ACTION: steps[ACTION]}
         ranges = {name: part.aminmax() for name, part in parts.items() if part.numel()}
@@ -388,7 +415,3 @@ class Task:
 def _form(entry: Tensor | TensorSpec) -> str:
     """Return the shape of an entry of stacks, chunks or steps, and the type of images."""
     return f"{list(entry.shape[1:])}{' of uint8' if entry.dtype == torch.uint8 else ''}"
-
-
-def _no_environment() -> EnvBase:
-    raise ValueError("these demonstrations have no environment: give Play a function that builds one")

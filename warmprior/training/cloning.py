@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from warmprior.checks import check_finite
 from warmprior.io.distributed import check_batch, from_leader, rank, wait_for_leader, world_size
-from warmprior.io.files import check_writable, exclusive
+from warmprior.io.files import check_writable, exclusive, storing
 from warmprior.io.progress import progress_bar
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
@@ -154,7 +154,8 @@ class BehaviourCloning:
         self._state = RunState(self.directory, self.identity)
         #: The path of the training state.
         self.state_path = self._state.path
-        self._restore()
+        self._state.restore(self._load)
+        self._compiles = compile
         if compile:
             self.update.compile()
 
@@ -183,7 +184,7 @@ class BehaviourCloning:
         from_leader(lambda: check_writable(self.directory))
         with exclusive(self.directory) if not self.rank else nullcontext():
             wait_for_leader()  # until it has locked the folder
-            self._restore()  # another process may have trained since this object was built
+            self._state.restore(self._load)  # another process may have trained since this object was built
             if from_leader(lambda: self.iteration) != self.iteration:
                 raise OSError(f"processes read different states at {self.state_path}: share the directory")
             try:
@@ -209,10 +210,11 @@ class BehaviourCloning:
         report = progress or (lambda iteration: None)
         report(self.iteration)
         with bar:
-            while self.iteration < config.iterations:
+            if self._compiles and self.iteration < config.iterations:
+                bar.set_postfix_str("compiling the network")
+            while (i := self.iteration + 1) <= config.iterations:
                 self._running.append(self.step())
                 bar.update()
-                i = self.iteration
                 report(i)
                 logs = i % config.log_every == 0 or i == config.iterations
                 saves = i in keep or i % save_every == 0
@@ -260,12 +262,10 @@ class BehaviourCloning:
                 "train/learning_rate": self.update.schedule.get_last_lr()[0],
                 "train/iterations_per_second": (self.iteration - iteration) / (self._logged[1] - moment),
             }
-            try:
+            place = Path(getattr(self.logger, "log_dir", None) or ".")  # Weights & Biases may have none
+            with storing(f"cannot write the log to {place}", place):  # a full disk's error names no file
                 for name, value in values.items():
                     self.logger.log_scalar(name, value, step=self.iteration)
-            except OSError as error:  # the error of a full disk names no file
-                place = getattr(self.logger, "log_dir", type(self.logger).__name__)
-                raise OSError(error.errno, f"cannot write the log: {error.strerror}", str(place)) from error
 
     def _save(self) -> None:
         tensors = {
@@ -284,10 +284,6 @@ class BehaviourCloning:
         self.generator.manual_seed(int(torch.randint(2**62, ())))
         if self._prefetch is not None:
             self._prefetch.restore(int(torch.randint(2**62, ())))
-
-    def _restore(self) -> None:
-        """Continue from the folder's state, if it has one that is not restored already."""
-        self._state.restore(self._load)
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
         self.iteration = facts["iteration"]

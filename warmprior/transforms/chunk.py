@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import dropwhile
 from typing import Any, Literal, get_args
 
 import torch
@@ -327,21 +328,15 @@ class ChunkStep(EnvTransform):
                 if any(f"{refused.__name__}(" in text for text in (*below, *_descriptions(inner.base))):
                     raise RuntimeError(f"ChunkStep cannot come after {refused.__name__}, {why}")
             self._check_shapes(inner.base, parent)
-            self._check_later()
+            later = dropwhile(lambda part: part is not self, flat(self.container.transform))
+            if any(_acts_as(part, FrameSkipTransform) for part in later):
+                raise RuntimeError(
+                    "FrameSkipTransform after ChunkStep would repeat chunks, of which the history sees one: "
+                    "append it before, where it repeats single actions"
+                )
             late = LateTransforms.of(inner, read, self.in_keys_inv)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
-
-    def _check_later(self) -> None:
-        """Raise RuntimeError if a later transform would execute a chunk several times in a decision."""
-        container = self.container
-        transforms = list(flat(container.transform)) if isinstance(container, TransformedEnv) else [self]
-        place = next(i for i, transform in enumerate(transforms) if transform is self)
-        if any(_acts_as(transform, FrameSkipTransform) for transform in transforms[place:]):
-            raise RuntimeError(
-                "FrameSkipTransform after ChunkStep would repeat chunks, of which the history sees one: "
-                "append it before, where it repeats single actions"
-            )
 
     def _check_shapes(self, base: EnvBase, parent: EnvBase) -> None:
         """Raise RuntimeError unless every row has one end flag and observations of the same shapes."""

@@ -23,7 +23,7 @@ from lab.demonstrations.data_options import (
     without_images,
 )
 from warmprior.io.distributed import check_batch, launched
-from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.defaults import EVALUATION_SEED
 from warmprior.options.training import NetworkOptions, TrainingConfig
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.recording import Recording
 from warmprior.modules.registry import registered
 from warmprior.options.data import IMAGE_SIZE, Resize
-from warmprior.options.evaluation import DEFAULT_NFE
+from warmprior.options.defaults import DEFAULT_NFE
 from warmprior.options.source import DEFAULT_PRIOR, PRIOR_OF_TARGETS
 from warmprior.options.training import Encoder
 from warmprior.training import warmup_cosine

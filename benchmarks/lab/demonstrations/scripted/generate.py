@@ -28,7 +28,7 @@ from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
-from warmprior.options.evaluation import EVALUATION_SEED
+from warmprior.options.defaults import EVALUATION_SEED
 
 #: Part of every cached file's name; raised when the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
@@ -54,7 +54,7 @@ def generate_demonstrations(
     Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
     kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
     official files. The content does not depend on the number of workers. All seeds are smaller
-    than :data:`~warmprior.options.evaluation.EVALUATION_SEED`.
+    than :data:`~warmprior.options.defaults.EVALUATION_SEED`.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``stack`` or ``transport``.

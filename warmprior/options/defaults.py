@@ -1,4 +1,4 @@
-"""Options of evaluations."""
+"""Defaults that several rooms share."""
 
 DEFAULT_NFE = 3
 """The default number of network evaluations per chunk; docs/which_source.md has the reasons."""
