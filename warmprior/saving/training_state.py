@@ -224,7 +224,7 @@ HASHED_AT_ONCE = 2**26
 
 
 STATE_FORMAT = 8
-"""A version in every identity; it is raised whenever the same options lead to other weights."""
+"""A version in every identity; raised whenever the same options lead to other weights or another file."""
 
 
 def run_identity(data: TensorDictBase | str, config: Any, **parts: Any) -> dict[str, Any]:
