@@ -69,7 +69,7 @@ for name in [name for name in sys.modules if name.split(".")[0] == "warmprior"]:
 
 @pytest.fixture(scope="module")
 def fresh():
-    """What a process says: it imports the package, then again without other packages.
+    """Return what a process says that imports the package, then again without other packages.
 
     PyTorch, whose import takes seconds, is imported once.
     """

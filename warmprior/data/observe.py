@@ -11,7 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from warmprior.data.checks import DatasetError, check_count, check_env_args, store_finite
-from warmprior.data.formats.hdf5 import member, open_robomimic, read_described, reading, selected_demos
+from warmprior.data.formats.hdf5 import open_robomimic, read_described, selected_demos
+from warmprior.data.formats.hdf5_file import member, reading
 from warmprior.envs.control_loop import StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.robosuite_tasks import low_dim_keys

@@ -85,7 +85,7 @@ def _no_environment() -> EnvBase:
 
 @dataclass(frozen=True)
 class RecordedEnvironment:
-    """What is known of the environment in which demonstrations were recorded.
+    """A record of what is known of the environment in which demonstrations were recorded.
 
     Attributes:
         index: the demonstrations, with the observations that policies see.

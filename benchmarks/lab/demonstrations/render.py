@@ -14,7 +14,8 @@ from tqdm import tqdm
 from lab.io.workers import available_cores, working
 from warmprior.checks import check_distinct, check_whole_numbers, given
 from warmprior.data.checks import DatasetError
-from warmprior.data.formats.hdf5 import RobomimicDemonstrations, member, open_robomimic, reading
+from warmprior.data.formats.hdf5 import RobomimicDemonstrations, open_robomimic
+from warmprior.data.formats.hdf5_file import member, reading
 from warmprior.data.image_check import StateRenderer, renderer_versions
 from warmprior.data.index import DatasetIndex
 from warmprior.envs.rendering import require_rendering

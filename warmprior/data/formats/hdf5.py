@@ -1,19 +1,13 @@
-"""A reader of robomimic's HDF5 layout, with errors that say which demo, key and row is wrong.
-
-A file can refer to other files on the machine for its contents, and declare more than it stores, which HDF5
-reads as zeros. Everything here is opened by :func:`member`, which refuses both.
-"""
+"""A reader of robomimic's HDF5 layout, with errors that say which demo, key and row is wrong."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from itertools import pairwise, product
-from math import ceil, prod
+from contextlib import contextmanager, suppress
+from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, override
+from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
 import torch
@@ -30,7 +24,16 @@ from warmprior.data.checks import (
     unknown_name_error,
 )
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.heaps import open_checked
+from warmprior.data.formats.hdf5_file import (
+    AGAIN,
+    LEAVE_OUT,
+    follow,
+    member,
+    names,
+    open_hdf5,
+    place_of,
+    reading,
+)
 from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader, pose_keys
 from warmprior.envs.robosuite_tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
@@ -40,160 +43,11 @@ if TYPE_CHECKING:
     import h5py
 
 
-CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, even to read a few rows
 RATE = "control_freq"
 """The attribute of ``data`` with the control steps per second, for files that describe no environment."""
 
-_MAX_SOFT_LINKS = 16
-_AGAIN = "Copy or download it again."
-_COPY = "Other files are not read: copy the data into this file."
-_LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
-_OBSERVE = "use the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
-
-
-def reading(parent: h5py.Group, name: str) -> AbstractContextManager[None]:
-    """Turn any error inside into a DatasetError that names the file and the object below ``parent``."""
-    return checks.reading(_place(parent, name), _AGAIN)
-
-
-def names(group: h5py.Group) -> list[str]:
-    """Return the names in a group, sorted, and check that each occurs once."""
-    with reading(group, ""):
-        listed = sorted(group)
-    if twice := [name for name, following in pairwise(listed) if name == following]:
-        raise DatasetError(f"{_place(group)} has the name {twice[0]!r} twice, so another is lost. {_AGAIN}")
-    return listed
-
-
-def member(
-    parent: h5py.Group, name: str, kind: Literal["group", "dataset"] | None = None
-) -> h5py.Group | h5py.Dataset | None:
-    """Open a group or dataset below ``parent`` that is fully stored in this file; ``None`` without one."""
-    with reading(parent, name):
-        item = _follow(parent, name, _MAX_SOFT_LINKS)
-        if item is None:
-            return None
-        actual = "group" if isinstance(item, require("h5py", "sim").Group) else "dataset"
-        if kind not in (None, actual):
-            raise DatasetError(f"{_place(parent, name)} is a {actual}, not a {kind}; rebuild the file")
-        if actual == "dataset":
-            _check_stored(item)
-        return item
-
-
-def check_members(parent: h5py.Group, name: str, met: set[int] | None = None) -> None:
-    """Raise DatasetError unless what is below ``parent`` is fully stored in this file, with all it holds.
-
-    A group under two names, ``met`` before, is refused: one that holds itself has no end.
-    """
-    met = set() if met is None else met
-    with reading(parent, name):
-        item = member(parent, name)
-        if isinstance(item, require("h5py", "sim").Group):
-            place = require("h5py.h5o", "sim").get_info(item.id).addr
-            if place in met:
-                raise DatasetError(f"{_place(parent, name)} is a group with another name as well. {_AGAIN}")
-            met.add(place)
-            for inner in names(item):
-                check_members(item, inner, met)
-        elif item is not None and item.dtype.hasobject:
-            item[()]  # which checks its heaps
-
-
-def _place(parent: h5py.Group, name: str = "") -> str:
-    """Name an object in errors: the file, and the path in it."""
-    path = f"{parent.name}/{name}".strip("/") or "/"
-    return f"{parent.file.filename}: {path}"
-
-
-def _follow(node: h5py.Group, name: str, soft_links: int) -> h5py.Group | h5py.Dataset | None:
-    # Links are followed one by one, with low-level calls: h5py's own, even ``in``, would open other files.
-    h5py = require("h5py", "sim")
-    for part in name.strip("/").split("/"):
-        if not isinstance(node, h5py.Group):
-            raise DatasetError(f"{_place(node)} is a dataset, not a group; rebuild the file")
-        links, key = node.id.links, part.encode(errors="surrogateescape")
-        if not links.exists(key):
-            return None
-        kind = links.get_info(key).type
-        if kind == h5py.h5l.TYPE_HARD:
-            node = node[part]
-        elif kind == h5py.h5l.TYPE_SOFT:
-            if soft_links == 0:
-                raise DatasetError(f"{_place(node, part)} leads through too many links")
-            target = links.get_val(key).decode(errors="surrogateescape")
-            start = node.file if target.startswith("/") else node
-            node = _follow(start, target, soft_links - 1)
-            if node is None:
-                return None
-        else:
-            where = links.get_val(key)[0].decode(errors="replace") if kind == h5py.h5l.TYPE_EXTERNAL else ""
-            raise DatasetError(f"{_place(node, part)} is a link to another file {where}. {_COPY}")
-    return node
-
-
-def _check_stored(dataset: h5py.Dataset) -> None:
-    """Raise DatasetError unless a dataset's values are all in this file, and can be read within bounds."""
-    what = _place(dataset)
-    if dataset.is_virtual or dataset.external:
-        raise DatasetError(f"{what} has its values in another file. {_COPY}")
-    if not dataset.size:
-        return
-    places: list[tuple[int, int]] = []  # first byte and size of each stored part in the file
-    if dataset.chunks is None:
-        stored = dataset.id.get_storage_size()
-        complete = stored >= dataset.size * dataset.dtype.itemsize
-        if dataset.id.get_offset() is not None:  # a compact one lies in its header
-            places.append((dataset.id.get_offset(), stored))
-    else:
-        chunk_bytes = prod(dataset.chunks) * dataset.dtype.itemsize
-        if chunk_bytes > CHUNK_BYTES:
-            raise DatasetError(
-                f"{what} has chunks of {chunk_bytes:.1e} bytes: h5repack -l makes smaller ones"
-            )
-        dimensions = list(zip(dataset.shape, dataset.chunks, strict=True))
-        complete = dataset.id.get_num_chunks() >= prod(ceil(n / c) for n, c in dimensions)
-        if complete:
-            parts: dict[tuple[int, ...], tuple[int, int]] = {}
-            dataset.id.chunk_iter(lambda p: parts.update({p.chunk_offset: (p.byte_offset, p.size)}))
-            places = sorted(parts.values())
-            # HDF5 reads a part that is missing in its index as zeros.
-            if not all(start in parts for start in product(*(range(0, n, c) for n, c in dimensions))):
-                raise DatasetError(f"{what}: its index of chunks is damaged. {_AGAIN}")
-    ends = [*(first for first, _ in places[1:]), dataset.file.id.get_filesize()]
-    if any(first + size > end for (first, size), end in zip(places, ends, strict=bool(places))):
-        raise DatasetError(f"{what}: its values overlap, or lie after the file's end. {_AGAIN}")
-    if not complete:
-        raise DatasetError(f"{what} has values that were never written. {_LEAVE_OUT}")
-
-
 _IMAGE_BYTES = 2**24  # bytes of images that are read at once
-
-
-@contextmanager
-def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
-    """Open a file for reading; raise DatasetError if it is none of HDF5's."""
-    h5py = require("h5py", "sim")
-    path = Path(path)
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name a file of it")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; check the path")
-    with ExitStack() as opened:
-        try:
-            opened.enter_context(h5py.File(path, "r"))  # for HDF5's lock, which the other lacks
-            file = opened.enter_context(open_checked(path))
-        except BlockingIOError as error:
-            raise DatasetError(
-                f"{path}: another process has it open to write ({error}): close it there, or wait; on a file "
-                "system without locks set HDF5_USE_FILE_LOCKING=FALSE"
-            ) from error
-        except OSError as error:
-            if error.errno is not None:  # the system's reason, not the format's
-                raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-            what = f"{path}: not a readable HDF5 file ({path.stat().st_size} bytes; {error})"
-            raise DatasetError(f"{what}. {_AGAIN}") from error
-        yield file
+_OBSERVE = "use the low_dim file, or replay its states (python -m warmprior observe FILE OUT)"
 
 
 @contextmanager
@@ -247,9 +101,9 @@ def read_described(file: h5py.File, name: str) -> Any:
         return json.loads(attributes[name]) if name in attributes else None
 
 
-def _number(group: h5py.Group, name: str, advice: str = _AGAIN) -> float | None:
+def _number(group: h5py.Group, name: str, advice: str = AGAIN) -> float | None:
     """Return a number among a group's attributes, or ``None`` if there is none."""
-    with checks.reading(f"{_place(group)}.attrs[{name!r}]", advice):
+    with checks.reading(f"{place_of(group)}.attrs[{name!r}]", advice):
         value = group.attrs.get(name)
         return None if value is None else float(np.asarray(value).item())
 
@@ -268,14 +122,14 @@ def _check_count(group: h5py.Group, name: str, steps: int) -> None:
     count = _number(group, name)
     if count is not None and count != steps:
         raise DatasetError(
-            f"{_place(group)}.attrs[{name!r}] counts {count:g} steps, but there are {steps}: a demo is "
+            f"{place_of(group)}.attrs[{name!r}] counts {count:g} steps, but there are {steps}: a demo is "
             "missing, incomplete or padded. Copy or download it again, or correct the attribute."
         )
 
 
 def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]:
     """Return the steps of a demo and the width of each key, after checking that they agree."""
-    what, steps, widths = _place(demo), 0, {}
+    what, steps, widths = place_of(demo), 0, {}
     observations = member(demo, "obs", "group")
     if observations is None:
         raise DatasetError(f"{what} has no group 'obs': it holds no observations: {_OBSERVE}")
@@ -289,7 +143,7 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
         shape: tuple[int, ...] = dataset.shape or ()
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0 or shape[:1] != (steps,):
-            raise DatasetError(f"{what}/{key} has shape {shape}, not {steps or 'some'} rows. {_LEAVE_OUT}")
+            raise DatasetError(f"{what}/{key} has shape {shape}, not {steps or 'some'} rows. {LEAVE_OUT}")
         if len(shape) > 2 or dataset.dtype.kind not in "fiub":
             kind = f"shape {shape} and type {dataset.dtype}"
             raise DatasetError(f"{what}/{key} has {kind}, expected vectors of numbers: leave the key out")
@@ -300,7 +154,7 @@ def _widths(demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]
 def _option(observations: h5py.Group, key: str) -> str:
     """Return the option that takes an observation, for numbers or vectors and for images, or ""."""
     with reading(observations, key):
-        item = _follow(observations, key, _MAX_SOFT_LINKS)
+        item = follow(observations, key)
         if not isinstance(item, require("h5py", "sim").Dataset):
             return ""
         if len(item.shape or ()) in (1, 2) and item.dtype.kind in "fiub":
@@ -321,16 +175,16 @@ def _image_shapes(demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[str
     """Return heights and widths of a demo's images, after checking their shapes and types."""
     shapes = {}
     for key in keys:
-        what, images = _place(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
+        what, images = place_of(demo, f"obs/{key}"), member(demo, f"obs/{key}", "dataset")
         if images is None:
             options = _options(demo["obs"], names(demo["obs"]))
             others = [name for name, option in options.items() if option == "images"]
             if not others:
                 raise DatasetError(
-                    f"{_place(demo)} has no images: leave the images out, or render them from its states "
+                    f"{place_of(demo)} has no images: leave the images out, or render them from its states "
                     "(python benchmarks/demonstrations.py render)"
                 )
-            raise unknown_name_error(_place(demo), "images", key, others)
+            raise unknown_name_error(place_of(demo), "images", key, others)
         shape: tuple[int, ...] = images.shape or ()
         rows, *size, colours = shape if len(shape) == 4 else (0, 0, 0)
         if images.dtype != "uint8" or (rows, colours) != (steps, 3) or not min(size):
@@ -357,7 +211,7 @@ class RobomimicReader(DemonstrationReader):
             rows = out[start : start + BLOCK]
             with reading(self.file, f"data/{demo}/{key}"):
                 block = dataset[first + start : first + start + len(rows)]
-            store_finite(block, rows, what, _LEAVE_OUT, first + start)
+            store_finite(block, rows, what, LEAVE_OUT, first + start)
 
     def images(self, demo: str, key: str) -> Iterator[Tensor]:
         """Read block by block."""
@@ -453,19 +307,19 @@ class RobomimicDemonstrations(Demonstrations):
             for name in selected:
                 demo = member(file["data"], name, "group")
                 if demo is None:  # the name is listed, but a damaged index hides the demo
-                    raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
+                    raise DatasetError(f"{path}: data/{name} cannot be read. {AGAIN}")
                 steps, widths = _widths(demo, obs_names)
                 _check_count(demo, "num_samples", steps)
                 if lengths and widths.keys() != expected.keys():
                     raise DatasetError(
-                        f"{_place(demo)} and data/{selected[0]}: only one of them has 'rewards'"
+                        f"{place_of(demo)} and data/{selected[0]}: only one of them has 'rewards'"
                     )
                 for key, width in expected.items():
                     if widths[key] != width:
                         leave = "" if key == "actions" else ", or choose observations"
                         raise DatasetError(
-                            f"{_place(demo, key)} has shape {demo[key].shape}; {whose} has {width} columns. "
-                            f"Use demos of one environment and controller{leave}."
+                            f"{place_of(demo, key)} has shape {demo[key].shape}; {whose} has {width} "
+                            f"columns. Use demos of one environment and controller{leave}."
                         )
                 held = names(demo["obs"])
                 common, present = common & {*held}, present | {*held}
@@ -474,7 +328,7 @@ class RobomimicDemonstrations(Demonstrations):
                 sizes = _image_shapes(demo, images, steps)
                 if shapes and sizes != shapes:
                     raise DatasetError(
-                        f"{_place(demo)} has images of {sizes}, and data/{selected[0]} of {shapes}: render "
+                        f"{place_of(demo)} has images of {sizes}, and data/{selected[0]} of {shapes}: render "
                         "them again, or leave the demo out"
                     )
                 shapes = sizes

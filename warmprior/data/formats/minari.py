@@ -19,7 +19,7 @@ from torch import Tensor
 from warmprior.checks import check_shape
 from warmprior.data.checks import DatasetError, check_count, reading, store_finite, unknown_name_error
 from warmprior.data.demonstrations import Demonstrations
-from warmprior.data.formats.hdf5 import check_members, member, names, open_hdf5
+from warmprior.data.formats.hdf5_file import check_members, member, names, open_hdf5
 from warmprior.data.index import DatasetIndex, DemonstrationReader
 from warmprior.io.extras import require
 from warmprior.io.files import check_regular_files, digest_of, file_digest, read_json
