@@ -26,7 +26,7 @@ class ActionHistory(EnvTransform):
     workers, and when only some sub-environments reset. :mod:`warmprior.history` describes the layout.
 
     Args:
-        history_length: number of executed actions that are remembered, usually ``H``.
+        history_length: number of executed actions that are remembered, that of the prior (usually ``H``).
         chunk_key: key of the executed chunk.
         history_key: where the history is written. Policies that share an environment need different keys.
 
