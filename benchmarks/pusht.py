@@ -60,9 +60,7 @@ def task(options: DataOptions, relative: bool = False) -> Task:
     steps = open_demonstrations(place, demos=options.first("human")).steps(OBSERVATION)
     if relative:
         steps["action"] = steps["action"] - steps["observation"][:, :2]
-    play = Play(
-        partial(make_env, relative), success="is_success", measures={"coverage": "max"}, video_rate=10
-    )
+    play = Play(partial(make_env, relative), measures={"coverage": "max"}, video_rate=10)
     return Task(demonstrations_of(steps, "pusht", style="relative" if relative else "human"), play=play)
 
 

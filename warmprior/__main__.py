@@ -267,7 +267,8 @@ def improve(
         f"{config.gamma:g} per chunk, NFE {config.nfe}",
         flush=True,
     )
-    place = out / f"{Path(folder).parent.name}-{Path(folder).name}-{algorithm}-seed{seed}"
+    absolute = Path(folder).absolute()
+    place = out / f"{absolute.parent.name}-{absolute.name}-{algorithm}-seed{seed}"
     options: Any = {"num_envs": num_envs, "config": config, "compile": compile, "episodes": episodes}
     result = improve_policy(actor, place, **options)
     save_policy(result.policy, place / "policy")
@@ -275,7 +276,7 @@ def improve(
         "no agent was better, so the policy is as it was; residuals move its actions, which are between -1 "
         f"and 1, by {result.reach:.2f}"
     )
-    if result.policy.start is not actor.start:
+    if result.improved:
         words = f"solved of {episodes} other episodes: {result.before} before, {result.after} after"
     print(f"{words}\nto evaluate it: {command_of('evaluate', place / 'policy')}")
 

@@ -46,7 +46,7 @@ def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
     # The agent, then the block's corners; both within [-1, 1].
     assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
     assert every.data["observation"].abs().max().item() == pytest.approx(1.0)
-    assert every.play.success == "is_success" and every.play.measures == {"coverage": "max"}
+    assert every.play.success == "success" and every.play.measures == {"coverage": "max"}
     # Offsets from where the agent is.
     raw, moved = (t.normalizer.denormalize(t.data.clone()) for t in (every, pusht.relative(given[0])))
     torch.testing.assert_close(moved["action"] + raw["observation"][:, :2], raw["action"])

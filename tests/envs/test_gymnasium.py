@@ -12,7 +12,7 @@ import numpy as np
 from torchrl.envs import SerialEnv
 
 from tests.errors import raises, refuses
-from warmprior.envs.gymnasium import gym_env, registered_builder, registered_env
+from warmprior.envs.gymnasium import gym_env, registered_builder
 
 
 class Dial(gymnasium.Env):
@@ -55,7 +55,7 @@ def played(env, seed):
     for action in actions():
         data = env.step(data.set("action", action))["next"]
         found.append(data)
-    return [[d[key].squeeze().tolist() for d in found] for key in ("observation", "solved", "height")]
+    return [[d[key].squeeze().tolist() for d in found] for key in ("observation", "success", "height")]
 
 
 @pytest.mark.parametrize("seed", [0, 7])
@@ -103,7 +103,6 @@ def test_flags_and_whole_numbers_are_read_as_floats_and_a_choice_is_refused():
 
 @pytest.mark.parametrize("name", ["turns", "dial", "observation", "reward", "terminated"])
 def test_info_replaces_nothing_else_that_a_step_returns(name):
-    refuses(lambda: gym_env(Dial(nested=True), success=name), ValueError, f"['{name}'] of info")
     with raises(ValueError, f"['{name}'] of info"):
         gym_env(Dial(nested=True), success="solved", measures=["height", name])
 
@@ -193,22 +192,21 @@ def test_a_builder_takes_the_entry_with_it_if_it_can(monkeypatch):
     assert isinstance(cloudpickle.loads(sent)().base_env._env.unwrapped, Dial)
 
 
-def test_a_registered_environment_numbers_its_episodes_if_asked(monkeypatch):
-    env = registered_env(registered_dial(monkeypatch), seed_offset=1, seed_stride=3)
-    resets = env.base_env._env.unwrapped.resets
-    before = len(resets)
-    env.set_seed(10)
-    for _ in range(3):
-        env.reset()
-    assert resets[before:] == [11, 14, 17]
+@pytest.mark.parametrize("tells", ["always", "when solved", "never"])
+def test_a_success_that_info_never_has_is_said_once(tells, recwarn):
+    class Telling(Dial):
+        def step(self, action):
+            seen, *rest, _ = super().step(action)
+            solved = self.at > 0.5
+            told = tells == "always" or (solved and tells == "when solved")
+            return seen, *rest, {"is_success": solved} if told else {}
 
-
-def test_a_sparse_reward_is_success(monkeypatch):
-    described = registered_dial(monkeypatch)
-    env = registered_env(described, sparse_reward=True, terminate_on_success=False)
+    env = gym_env(Telling(), success="is_success")
     env.set_seed(1)
-    after = torch.cat([env.rollout(4, break_when_any_done=False)["next"] for _ in range(4)])
-    assert after["reward"].tolist() == after["success"].float().tolist()
-    assert 0 < after["reward"].sum() < len(after)
-    with raises(ValueError, "Dial-v0", "make_env"):
-        registered_env({**described, "success": None}, sparse_reward=True)
+    solved = [env.rollout(5)["next", "success"].any() for _ in range(8)]
+    assert any(solved) == (tells != "never")
+    said = [str(w.message) for w in recwarn if "is_success" in str(w.message)]
+    assert len(said) == (tells == "never" or (tells == "when solved" and not solved[0])) and all(
+        "solved" in text for text in said
+    )
+    refuses(lambda: gym_env(Dial(), success="solved", measures=["success"]), ValueError, "measures")

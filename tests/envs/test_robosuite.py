@@ -148,19 +148,6 @@ def test_seed_and_actions_determine_the_episode(lift):
     assert torch.equal(play(make_lift(), actions), play(lift, actions, seed=0)), "0 by default"
 
 
-def test_workers_share_out_the_episodes(lift):
-    def starts(env, count):
-        return [env.reset()["observation"] for _ in range(count)]
-
-    lift.set_seed(40, static_seed=True)
-    alone = starts(lift, 4)
-    for worker in range(2):
-        env = make_lift(seed=40, seed_offset=worker, seed_stride=2)
-        assert env.episode_seed == 40 + worker
-        for mine, expected in zip(starts(env, 2), alone[worker::2], strict=True):
-            assert torch.equal(mine, expected)
-
-
 def run_expert(env, steps, seed=0):
     td = env.reset()
     person = Demonstrator(SKILLED, np.random.default_rng(seed))

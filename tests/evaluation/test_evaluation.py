@@ -25,7 +25,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from tests.envs.test_gymnasium import registered_dial
+from tests.envs.test_gymnasium import Dial, registered_dial
 from tests.errors import raises, refuses
 from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
@@ -41,6 +41,7 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.data import demonstrations_of
+from warmprior.envs import gym_env
 from warmprior.envs.description import environment_of, environment_parts, registered_description
 from warmprior.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.evaluation.parallel import watched
@@ -57,9 +58,9 @@ class SeededEnv(CountingEnv):
     ``log`` every reset appends its seed to a file.
     """
 
-    def __init__(self, seed_offset=0, seed_stride=1, log=None, sleep=0.0):
+    def __init__(self, log=None, sleep=0.0):
         super().__init__()
-        self.offset, self.stride, self.log, self.sleep = seed_offset, seed_stride, log, sleep
+        self.log, self.sleep = log, sleep
         self.base, self.count, self.seed_ = 0, 0, 0
         self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
 
@@ -67,7 +68,7 @@ class SeededEnv(CountingEnv):
         self.base, self.count = seed, 0
 
     def _reset(self, tensordict=None, **kwargs):
-        self.seed_ = self.base + self.offset + self.count * self.stride
+        self.seed_ = self.base + self.count
         self.count += 1
         self.length = length_of(self.seed_)
         self.episode = self.seed_ - 1  # CountingEnv shows it in its observation
@@ -269,10 +270,10 @@ def test_a_spawned_worker_knows_what_this_process_registered(monkeypatch):
     assert {success for _, success in outcomes} == {False, True}
 
 
-def here_alone(pid, **options):
+def here_alone(pid):
     if os.getpid() != pid:
         raise LookupError("another process")
-    return SeededEnv(**options)
+    return SeededEnv()
 
 
 def test_a_worker_that_cannot_build_its_environment_is_no_bare_end_of_file():
@@ -365,17 +366,51 @@ def test_every_episode_once(place, tmp_path):
             assert place != "single" or played == list(seeds)
 
 
-@pytest.mark.parametrize("form", ["partial", "nested", "keywords"])
-def test_offsets_of_one_s_own_are_refused(form):
-    make_env, options = partial(SeededEnv, seed_offset=2), {}
-    if form == "nested":
-        make_env = partial(single, make_env)
-    if form == "keywords":
-        make_env, options = SeededEnv, {"create_env_kwargs": {"seed_offset": 2}}
-    env = SerialEnv(2, make_env, **options)
-    if form != "nested":
-        env = TransformedEnv(env, policy_transforms(PastPrior(H)))
-    refuses(lambda: evaluate(actor_for(), env, episodes=3, first_seed=7), ValueError, "seed_offset")
+def started_dial():
+    """A Gymnasium environment, of which only the first episode after a seed follows from it."""
+    return gym_env(Dial(), success="solved")
+
+
+def test_workers_number_the_episodes_of_any_environment():
+    alone = started_dial()
+    expected = []
+    for seed in range(40, 46):
+        alone.set_seed(seed)
+        expected.append(alone.reset()["observation"][0].item())
+    with closing(
+        parallel_env(started_dial, partial(policy_transforms, PRIOR, observation_steps=1), 2)
+    ) as env:
+        unseeded = torch.stack([env.reset()["observation"][:, 0, 0] for _ in range(3)])
+        env.set_seed(40, static_seed=True)
+        seeded = torch.stack([env.reset()["observation"][:, 0, 0] for _ in range(3)])
+    assert seeded.flatten().tolist() == expected
+    assert len({*unseeded.flatten().tolist()}) == 6
+
+
+class FailingEnv(SeededEnv):
+    def _step(self, tensordict):
+        raise LookupError("the simulator has lost the robot")
+
+
+def test_a_worker_with_an_error_of_its_own_was_not_out_of_memory():
+    env = parallel_env(FailingEnv, partial(policy_transforms, PRIOR), 2)
+    env.configure_parallel(shutdown_timeout=0.5)
+    with raises(WorkerError, "worker", "exit code 1", "error of its own") as caught:
+        evaluate(actor_for(), env, episodes=2, first_seed=0)
+    assert "memory" not in str(caught.value)
+
+
+def test_an_interrupt_reaches_the_caller_and_no_worker():
+    env = environments(2)
+    env.reset()
+    workers = env._workers
+    for worker in workers:
+        os.kill(worker.pid, signal.SIGINT)  # as a terminal does
+    assert evaluate(actor_for(), env, episodes=3, first_seed=0) == expected(0, 3)
+    with pytest.raises(KeyboardInterrupt), watched(env):
+        os.kill(workers[1].pid, signal.SIGKILL)
+        workers[1].join()
+        raise KeyboardInterrupt
 
 
 def test_environments_that_cannot_be_judged():

@@ -117,7 +117,7 @@ def test_what_a_chunk_would_hide_from_an_episode_is_refused(batched):
 
 
 def test_chunks_inside_of_numbered_workers_are_looked_at_too():
-    env = parallel_env(lambda **numbers: Saying(), partial(policy_transforms, PastPrior(H)), 2)
+    env = parallel_env(Saying, partial(policy_transforms, PastPrior(H)), 2)
     with closing(env), raises(ValueError, "won", "policy_transforms"):
         evaluate(POLICY, env, episodes=2, first_seed=0, success="won")
 
@@ -169,7 +169,7 @@ def test_what_tells_of_whole_decisions_may_be_combined_in_any_way():
     }  # fmt: skip
     measures = {"executed_steps": "sum", "won": "max"}
     transforms = partial(policy_transforms, PastPrior(H), observation_steps=1, success="won")
-    with closing(parallel_env(lambda **numbers: Saying(), transforms, 1)) as env:
+    with closing(parallel_env(Saying, transforms, 1)) as env:
         (said,) = evaluate(POLICY, env, episodes=1, first_seed=1, success="won", measures=measures)
     assert said.measures == {"executed_steps": steps, "won": 1}
 

@@ -22,8 +22,8 @@ def make_decoder(prior, delta=0.5):
     return PriorDecoder(mlp_actor(prior, D_A, D_O, nfe=2), delta=delta)
 
 
-def build(prior=None, delta=0.5, decoder=None, hidden_dim=8, **options):
-    """A loss, and the networks that went into it (lists of two critics, all different)."""
+def build(prior=None, delta=0.5, decoder=None, hidden_dim=8, critics=2, **options):
+    """A loss, and the networks that went into it (lists of critics, all different)."""
     prior = PastPrior(H) if prior is None else prior
     decoder = make_decoder(prior, delta) if decoder is None else decoder
     sizes = (D_A, D_O, prior.prediction_length, TO)
@@ -31,9 +31,11 @@ def build(prior=None, delta=0.5, decoder=None, hidden_dim=8, **options):
     actor = make_prior_space_actor(*sizes, delta=decoder.delta, hidden_dim=hidden_dim)
     chunk = [
         make_prior_space_critic(*sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), hidden_dim=hidden_dim)
-        for _ in range(2)
+        for _ in range(critics)
     ]
-    noise = [make_prior_space_critic(*sizes, delta=decoder.delta, hidden_dim=hidden_dim) for _ in range(2)]
+    noise = [
+        make_prior_space_critic(*sizes, delta=decoder.delta, hidden_dim=hidden_dim) for _ in range(critics)
+    ]
     loss = DSRLNALoss(actor, chunk, noise, decoder, **options)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     return loss

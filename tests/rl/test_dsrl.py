@@ -26,7 +26,7 @@ from warmprior import (
 def networks(loss):
     def of(name, params):
         out = []
-        for i in range(2):
+        for i in range(len(params)):
             net = loss.get_stateful_net(name)
             params[i].to_module(net)
             out.append(net)
@@ -71,6 +71,7 @@ def squashed(actor, state, delta):
     [
         ({}, 0.5),
         ({}, 1.5),
+        ({"critics": 3}, 0.5),
         ({"backup_entropy": False}, 0.5),
         ({"discount": "decision"}, 0.5),
         ({"alpha_init": 0.3, "target_entropy": -2.0}, 0.5),

@@ -11,7 +11,7 @@ from tests.envs.test_gymnasium import registered_dial
 from tests.errors import raises
 from tests.rl.training_parts import H, SolvableEnv, make_actor, make_config, make_training
 from tests.states import same
-from tests.toy_env import mlp_actor
+from tests.toy_env import CountingEnv, mlp_actor
 from warmprior import GaussianPrior, PastPrior, RealTimeChunking, policy_transforms
 from warmprior.envs.description import environment_of, registered_description
 from warmprior.evaluation import evaluate, parallel_env
@@ -39,7 +39,7 @@ class ReachEnv(SolvableEnv):
         return out
 
 
-def make_env(seed_offset, seed_stride):
+def make_env():
     return ReachEnv(6)
 
 
@@ -83,13 +83,12 @@ def test_the_best_agent_of_the_evaluations_is_the_policy(tmp_path, prior):
 
 def test_a_policy_is_improved_compared_and_saved(tmp_path):
     actor = make_actor()
-    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
-    options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
+    options = {"make_env": make_env, "num_envs": 2, "description": None}
     config = make_config(environment_steps=60)
     result = improve_policy(actor, tmp_path / "run", config=config, episodes=4, **options)
     assert [row["evaluation"] for row in result.curve[:3]] == ["base", "greedy", "greedy"]
     save_policy(result.policy, tmp_path / "policy")
-    env = parallel_env(make_env, transforms, 2)
+    env = parallel_env(make_env, partial(policy_transforms, actor), 2)
     for policy, solved in ((actor, result.before), (load_policy(tmp_path / "policy"), result.after)):
         played = evaluate(policy, env, episodes=4, first_seed=10_000_000, nfe=2)
         assert sum(episode.success for episode in played) == solved
@@ -102,6 +101,43 @@ def test_a_policy_is_improved_compared_and_saved(tmp_path):
     )
 
 
+class ShapedEnv(ReachEnv):
+    """The same with a reward of its own."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        out["reward"] = -5.0 + out["observation"][..., 2:3]
+        return out
+
+
+def shaped_env():
+    return ShapedEnv(6)
+
+
+def test_success_is_the_reward_whatever_the_environment_s_own_is(tmp_path):
+    actor, config = make_actor(), make_config(environment_steps=60)
+    options = {"num_envs": 2, "description": None, "config": config, "episodes": 4}
+    states = []
+    for place, build in (("own", make_env), ("shaped", shaped_env)):
+        improve_policy(actor, tmp_path / place, make_env=build, **options)
+        states.append(load_state(tmp_path / place / "state.safetensors")[0])
+    assert same(*states)
+    name = next(name for name in states[0] if "reward" in name)
+    # By hand: a control step costs 1, one at which the task is solved nothing.
+    assert ((states[0][name] <= 0) & (states[0][name] >= -H)).all()
+    with raises(KeyError, "success", "gym_env"):
+        improve_policy(actor, tmp_path / "none", make_env=partial(CountingEnv, 6), **options)
+
+
+@pytest.mark.parametrize("offset", [1.0, 0.0])
+@pytest.mark.parametrize("truncate", [True, False])
+def test_failures_that_end_episodes_are_said_to_be_cheap(tmp_path, recwarn, truncate, offset):
+    # Every other episode is not solved.
+    make_training(tmp_path, env={"truncate": truncate}, reward_offset=offset).run()
+    said = [w for w in recwarn if "reward_offset" in str(w.message)]
+    assert len(said) == (offset > 0 and not truncate)
+
+
 def test_updates_have_the_threads_that_waiting_workers_would_take(tmp_path, monkeypatch):
     threads, original = set(), PriorSpaceAgent.learn
 
@@ -111,10 +147,9 @@ def test_updates_have_the_threads_that_waiting_workers_would_take(tmp_path, monk
 
     monkeypatch.setattr(PriorSpaceAgent, "learn", counting)
     actor = make_actor()
-    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
     with torch_threads(2):
         config, options = make_config(environment_steps=60), {"make_env": make_env, "num_envs": 2}
-        options |= {"make_transforms": transforms, "description": None}
+        options |= {"description": None}
         improve_policy(actor, tmp_path, config=config, episodes=2, **options)
     assert threads == {2}
 
@@ -136,8 +171,7 @@ def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monk
     monkeypatch.setattr(improve.PriorSpaceTraining, "run", lambda self: [])
     monkeypatch.setattr(improve.PriorSpaceTraining, "policy", lambda self: lucky)
     monkeypatch.setattr(improve.PriorSpaceTraining, "reach", lambda self: 0.1)
-    transforms = partial(policy_transforms, actor.prior, observation_steps=1)
-    options = {"make_env": make_env, "make_transforms": transforms, "num_envs": 2, "description": None}
+    options = {"make_env": make_env, "num_envs": 2, "description": None}
     result = improve_policy(actor, tmp_path, config=make_config(environment_steps=60), episodes=4, **options)
     kept = confirmed[1] > confirmed[0]
     assert (result.policy is lucky) is kept and (result.before, result.after) == (3, 3)
@@ -165,14 +199,12 @@ def test_a_policy_of_gymnasium_is_improved_by_its_success(tmp_path, monkeypatch)
 def test_a_policy_without_an_environment_is_refused(tmp_path):
     with raises(ValueError, "keeps no description"):
         improve_policy(make_actor(), tmp_path)
-    with raises(ValueError, "make_transforms"):
-        improve_policy(make_actor(), tmp_path, make_env=make_env)
     with raises(ValueError, 5000, "episodes"):
-        improve_policy(make_actor(), tmp_path, make_env=make_env, make_transforms=list, episodes=5001)
+        improve_policy(make_actor(), tmp_path, make_env=make_env, episodes=5001)
     with raises(ValueError, "guidance=None"):
         improve_policy(make_actor().replace(guidance=RealTimeChunking(execution_horizon=2)), tmp_path)
     registered = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": 20, "success": None}
     described = registered_description({**registered, "observation_keys": ["observation"]})
-    with raises(ValueError, "Pendulum-v1", "make_env"):
+    with raises(KeyError, "success"):
         improve_policy(make_actor().replace(environment=described), tmp_path)
     assert not list(tmp_path.iterdir())

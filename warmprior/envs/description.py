@@ -87,26 +87,24 @@ def robosuite_parts(
 
 
 def environment_parts(
-    actor: WarmPriorActor, *, by_success: bool = False
+    actor: WarmPriorActor,
 ) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
     """Return a builder of the environment that a policy was made for, and one of the policy's transforms.
 
-    ``by_success`` is True for agents: steps are rewarded by success alone, as robosuite's are anyway. Raises
-    ValueError if the policy keeps no description of an environment.
+    Raises ValueError if the policy keeps no description of an environment.
     """
     description: Any = actor.environment
     adapters: dict[str, Transform] = {}
     if is_registered(description):
-        registered = description["gymnasium"]
-        make_env: Callable[..., EnvBase] = registered_builder(registered, sparse_reward=by_success)
+        make_env: Callable[..., EnvBase] = registered_builder(description["gymnasium"])
     elif _is_complete(description):
         make_env, adapters = robosuite_parts(description)
     else:
         kept = "" if description is None else f" (it keeps {description})"
         raise ValueError(
             f"the policy keeps no description of an environment of robosuite or Gymnasium{kept}: it was "
-            "trained on demonstrations alone. Build your environment with policy_transforms(actor); for a "
-            "robot see docs/your_robot.md"
+            "trained on demonstrations alone. Build your environment with policy_transforms(actor), or give "
+            "improve_policy a make_env; for a robot see docs/your_robot.md"
         )
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(

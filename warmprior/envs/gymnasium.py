@@ -21,54 +21,68 @@ from torchrl.envs import (
     DoubleToFloat,
     DTypeCastTransform,
     GymWrapper,
-    RenameTransform,
     TransformedEnv,
 )
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from warmprior.checks import check_distinct, check_whole_numbers, given, is_true
+from warmprior.checks import check_distinct, given, is_true
 from warmprior.envs.rendering import rendering_backend
 from warmprior.keys import OBSERVATION, SUCCESS
 
 
 class _Infos(BaseInfoDictReader):
-    """A reader of numbers and flags in ``info`` as ``[1]``; entries missing after a step or reset are 0."""
+    """A reader of entries of ``info`` as ``[1]``: measures, and a flag that becomes ``"success"``.
 
-    def __init__(self, dtypes: Mapping[str, torch.dtype]) -> None:
-        self._dtypes = dict(dtypes)
+    Entries missing after a step or reset are 0.
+    """
+
+    def __init__(self, success: str | None, measures: Sequence[str]) -> None:
+        self.success, self._measures = success, list(measures)
+        self.present: set[str] = set()
+        """The names that were in ``info`` so far."""
 
     @property
     def info_spec(self) -> Composite:
-        return Composite({k: Unbounded((1,), dtype=dtype) for k, dtype in self._dtypes.items()})
+        numbers = {name: Unbounded((1,), dtype=torch.float32) for name in self._measures}
+        flag = {} if self.success is None else {SUCCESS: Unbounded((1,), dtype=torch.bool)}
+        return Composite(numbers | flag)
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
-        for key, dtype in self._dtypes.items():
-            value = info_dict.get(key, 0)
-            if dtype == torch.bool:
-                value = is_true(key, value)
-            tensordict.set(key, torch.as_tensor(value, dtype=dtype).reshape(1))
+        self.present.update(info_dict)
+        for name in self._measures:
+            value = torch.as_tensor(info_dict.get(name, 0), dtype=torch.float32)
+            tensordict.set(name, value.reshape(1))
+        if self.success is not None:
+            solved = is_true(self.success, info_dict.get(self.success, 0))
+            tensordict.set(SUCCESS, torch.tensor([solved]))
         return tensordict
 
 
 class _Gym(GymWrapper):
     """A wrapper whose episode after ``set_seed(seed)`` is that of a single ``reset(seed=seed)``."""
 
-    _next: int | None = None
-    ends_at: str | None = None
-    """The flag in ``info`` that ends the episode."""
-    rewards: str | None = None
-    """The flag in ``info`` that is the reward, in place of the environment's own."""
-    seed_offset, seed_stride = 0, None
-    """See :func:`registered_env`."""
+    _seed: int | None = None
+    ends_at_success = False
+    infos: _Infos | None = None
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         result = super()._step(tensordict)
-        if self.rewards is not None:
-            result.set("reward", result[self.rewards].to(result["reward"].dtype))
-        if self.ends_at is not None and result[self.ends_at].any():
+        if self.ends_at_success and result[SUCCESS].any():
             for flag in ("terminated", "done"):
                 result.set(flag, torch.ones_like(result[flag]))
+        if self.infos is not None and self.infos.success is not None and result["done"].any():
+            self._check_success(self.infos.success, self.infos.present)
         return result
+
+    def _check_success(self, success: str, present: set[str]) -> None:
+        """Warn of a success that info did not have in a whole episode."""
+        if success not in present:
+            warnings.warn(
+                f"info had no {success!r} in a whole episode, so it counts as not solved; it had "
+                f"{sorted(present)}: name the entry that tells success",
+                stacklevel=2,
+            )
+            present.add(success)  # once
 
     def read_obs(self, observations: Any) -> dict[str, Any]:
         # An environment may write all its observations into one buffer.
@@ -87,12 +101,11 @@ class _Gym(GymWrapper):
         return self
 
     def _set_seed(self, seed: int | None) -> None:
-        self._next = None if seed is None else seed + self.seed_offset
+        self._seed = seed
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if self._next is not None:
-            kwargs["seed"] = self._next
-            self._next = None if self.seed_stride is None else self._next + self.seed_stride
+        if self._seed is not None:
+            kwargs["seed"], self._seed = self._seed, None
         return super()._reset(tensordict, **kwargs)
 
 
@@ -108,8 +121,9 @@ def gym_env(
 
     Args:
         env: a Gymnasium environment whose action is one vector.
-        success: name of the entry of ``info`` that is True once the task is solved; written as bool ``[1]``,
-            False where ``info`` lacks it.
+        success: name of the entry of ``info`` that is True once the task is solved; written under
+            ``"success"`` as bool ``[1]``, False where ``info`` lacks it. A warning says if a whole episode
+            does.
         measures: names of further numbers in ``info``, written as float32 ``[1]``, 0 where it lacks them.
         observation_keys: entries of a dictionary of observations, concatenated in this order, with
             ``"outer/inner"`` in nested ones; by default all.
@@ -124,7 +138,7 @@ def gym_env(
         >>> import gymnasium
         >>> from warmprior.envs import gym_env
         >>> env = gym_env(gymnasium.make("Pendulum-v1"), success="is_success")
-        >>> env.reset()["observation"].shape, env.rollout(3)["next", "is_success"].any().item()
+        >>> env.reset()["observation"].shape, env.rollout(3)["next", "success"].any().item()
         (torch.Size([3]), False)
     """
     base = _Gym(env, categorical_action_encoding=True)
@@ -136,16 +150,18 @@ def gym_env(
     check_distinct("observation_keys", chosen)
     if missing := [key for key in chosen if key not in present]:
         raise KeyError(f"the environment has no observations {missing}: it has {list(present)}")
-    dtypes = dict.fromkeys(measures, torch.float32)
-    dtypes |= {} if success is None else {success: torch.bool}
-    if dtypes and base.batch_size:
+    entries = [*measures, *([] if success is None else [success])]
+    if entries:
+        check_distinct("measures", [*measures, *([] if success is None else [SUCCESS])])
+    if entries and base.batch_size:
         raise ValueError(
-            f"entries of info ({', '.join(dtypes)}) are read from single environments: give torchrl's "
+            f"entries of info ({', '.join(entries)}) are read from single environments: give torchrl's "
             "ParallelEnv one per worker, in place of a vector environment"
         )
-    if dtypes:
-        base.set_info_dict_reader(_Infos(dtypes))
-    base.ends_at = success if terminate_on_success else None
+    if entries:
+        base.infos = _Infos(success, measures)
+        base.set_info_dict_reader(base.infos)
+    base.ends_at_success = terminate_on_success and success is not None
     specs = {key: base.observation_spec[present[key]] for key in chosen}
     ndims = {key: spec.ndim - len(base.batch_size) for key, spec in specs.items()}
     if others := [key for key, ndim in ndims.items() if ndim < 1 or (ndim > 1 and len(specs) > 1)]:
@@ -171,10 +187,7 @@ def registered_env(
     description: Mapping[str, Any],
     *,
     terminate_on_success: bool = True,
-    sparse_reward: bool = False,
     horizon: int | None = None,
-    seed_offset: int = 0,
-    seed_stride: int | None = None,
     render_mode: str | None = None,
     entry: Any = None,
 ) -> TransformedEnv:
@@ -185,22 +198,17 @@ def registered_env(
 
     Args:
         description: ``"id"`` and ``"kwargs"`` of ``gymnasium.make``, ``"max_episode_steps"``, and
-            ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; success is written under
-            ``"success"``; in data also the ``"dataset"``, for errors.
+            ``"success"`` and ``"observation_keys"`` of :func:`gym_env`; in data also the ``"dataset"``, for
+            errors.
         terminate_on_success: see :func:`gym_env`.
-        sparse_reward: True rewards a step with 1 if the task is solved and with 0 otherwise, in place of the
-            environment's own reward.
         horizon: time limit in control steps, instead of ``"max_episode_steps"``.
-        seed_offset: offset added to every seed.
-        seed_stride: episode ``n`` after ``set_seed(seed)`` starts with ``seed + seed_offset + n *
-            seed_stride``, as in :class:`RobosuiteEnv`; by default only the first follows from a seed.
         render_mode: see ``gymnasium.make``; ``"rgb_array"`` for pictures.
         entry: the ``EnvSpec`` to build; by default the one that is registered under the name.
 
     Raises:
         ImportError: if no environment with this name is registered.
-        ValueError: if the description has wrappers, which would be imported, the environment cannot be built
-            as it says, or it needs a success for a sparse reward.
+        ValueError: if the description has wrappers, which would be imported, or the environment cannot be
+            built as it says.
 
     Examples:
         >>> from warmprior.envs import registered_env
@@ -208,8 +216,6 @@ def registered_env(
         >>> env.rollout(9)["next", "truncated"].flatten().tolist()
         [False, False, True]
     """
-    check_whole_numbers(0, seed_offset=seed_offset)
-    check_whole_numbers(**given(seed_stride=seed_stride))
     gymnasium = importlib.import_module("gymnasium")
     name, wrappers = description["id"], description.get("wrappers")
     for package in REGISTERING if name not in gymnasium.registry else ():
@@ -243,17 +249,12 @@ def registered_env(
         ) from error
     if env.spec.max_episode_steps is None:
         warnings.warn(f"{name} has no time limit: episodes may never end without a horizon", stacklevel=2)
-    success = description.get("success")
-    chosen = description.get("observation_keys") or ()
-    if sparse_reward and success is None:
-        raise ValueError(f"nothing in info says when {name} is solved: give a make_env that rewards success")
-    made = gym_env(env, success=success, observation_keys=chosen, terminate_on_success=terminate_on_success)
-    base: Any = made.base_env
-    base.rewards = success if sparse_reward else None
-    base.seed_offset, base.seed_stride = seed_offset, seed_stride
-    if success not in (None, SUCCESS):
-        made.append_transform(RenameTransform([success], [SUCCESS]))
-    return made
+    return gym_env(
+        env,
+        success=description.get("success"),
+        observation_keys=description.get("observation_keys") or (),
+        terminate_on_success=terminate_on_success,
+    )
 
 
 def registered_builder(description: Mapping[str, Any], **options: Any) -> Callable[..., TransformedEnv]:

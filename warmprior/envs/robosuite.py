@@ -40,9 +40,7 @@ class RobosuiteEnv(EnvBase):
     ==================  =============================================================
 
     The n-th reset after :meth:`set_seed` (or after construction) plays the episode of simulator seed ``seed +
-    seed_offset + n * seed_stride``. With ``seed_offset=i, seed_stride=workers`` and the same seed for all
-    (``set_seed(seed, static_seed=True)``), worker ``i`` of a :class:`~torchrl.envs.ParallelEnv` plays every
-    ``workers``-th episode. The global generators of numpy and Python are not changed.
+    n``, counted from 0. The global generators of numpy and Python are not changed.
 
     Policies that see images need them only at decisions, for which
     :class:`~warmprior.transforms.CameraImages` renders them. TorchRL's ``PixelRenderTransform(render_method=
@@ -65,8 +63,6 @@ class RobosuiteEnv(EnvBase):
         eef_pose: True writes the grippers' poses in the world: rotation and, in the last column, position in
             metres (see :class:`~warmprior.transforms.AbsoluteActions`).
         seed: seed of the first episode.
-        seed_offset: offset added to every seed.
-        seed_stride: difference between the seeds of consecutive episodes.
         terminate_on_success: True ends the episode once the task is solved.
         device: device of the tensordicts.
 
@@ -100,8 +96,6 @@ class RobosuiteEnv(EnvBase):
         sim_state: bool = False,
         eef_pose: bool = False,
         seed: int = 0,
-        seed_offset: int = 0,
-        seed_stride: int = 1,
         terminate_on_success: bool = True,
         device: torch.device | str | None = None,
     ) -> None:
@@ -110,7 +104,7 @@ class RobosuiteEnv(EnvBase):
         check_choice("style", style, STYLES)
         if control_loop is not None:
             check_choice("control_loop", control_loop, _LOOPS)
-        check_whole_numbers(seed_stride=seed_stride, horizon=1 if horizon is None else horizon)
+        check_whole_numbers(horizon=1 if horizon is None else horizon)
         if task is not None:
             env_args = task_env_args(task)
         elif env_args is not None:
@@ -137,15 +131,10 @@ class RobosuiteEnv(EnvBase):
         self.fast_rendering = fast_rendering
         self.sim_state, self.eef_pose = sim_state, eef_pose
         self.terminate_on_success = terminate_on_success
-        self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
-        self._episode, self._elapsed = 0, 0
+        self._next_seed = seed
+        self._elapsed = 0
         self._make_specs(self._env)
         self.is_closed = False
-
-    @property
-    def episode_seed(self) -> int:
-        """The simulator seed that the next reset uses."""
-        return self._seed + self._offset + self._episode * self._stride
 
     def render_frame(
         self,
@@ -198,7 +187,7 @@ class RobosuiteEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._seed, self._episode = seed, 0
+            self._next_seed = seed
 
     def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         # Kept short: it runs between physics steps, which evict everything else from the caches.
@@ -226,8 +215,8 @@ class RobosuiteEnv(EnvBase):
         return result if self.device is None else result.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        observations = self.loop.reset(self.episode_seed)
-        self._episode += 1
+        observations = self.loop.reset(self._next_seed)
+        self._next_seed += 1
         self._elapsed = 0
         return self._tell(observations).exclude("reward")
 

@@ -210,9 +210,9 @@ def evaluate(
         description: label of the progress bar; no bar if ``None``.
 
     Raises:
-        ValueError: if ``episodes < 1``; if the environment has several batch dimensions, cannot play given
-            seeds in its rows, or adds an offset to them; if it lacks the policy's normaliser, or the
-            policy has keys of its own; or if ``success`` or ``measures`` are given with a :class:`Task`.
+        ValueError: if ``episodes < 1``; if the environment has several batch dimensions, or cannot play given
+            seeds in its rows; if it lacks the policy's normaliser, or the policy has keys of its own; or if
+            ``success`` or ``measures`` are given with a :class:`Task`.
         KeyError: see :func:`play_episode`.
         RuntimeError: if a transform around workers repeats or skips chunks (:class:`~warmprior.ChunkStep`).
         WorkerError: a ``RuntimeError``, if a worker process dies.

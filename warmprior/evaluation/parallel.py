@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, override
 
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -17,15 +18,36 @@ from torchrl.envs.transforms import Compose
 from warmprior.checks import check_whole_numbers
 from warmprior.io.workers import WorkerError, dead_worker_error, end_with_parent, start_method
 from warmprior.transforms.normalize import FollowsNormalizer
+from warmprior.transforms.policy import PolicyEnv
 
 
-def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
+class _NumberedEnv(PolicyEnv):
+    """The environment of worker ``first`` of ``number``, which plays every ``number``-th seed."""
+
+    first, number = 0, 1
+    _next = 0
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        self._next = self.first + (seed or 0)
+        return super().set_seed(seed, static_seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        self.base_env.set_seed(self._next, static_seed=True)
+        self._next += self.number
+        return super()._reset(tensordict, **kwargs)
+
+
+def _transformed(
+    make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose], first: int, number: int
+) -> EnvBase:
     end_with_parent()
-    return TransformedEnv(make_env(), make_transforms())
+    env = _NumberedEnv(make_env(), make_transforms())
+    env.first, env.number, env._next = first, number, first
+    return env
 
 
 class _StridedEnv(ParallelEnv):
-    """Environments whose workers number their own episodes, see :func:`parallel_env`."""
+    """Environments whose workers number their own episodes (:class:`_NumberedEnv`)."""
 
     strided_seeds = True
     make_transforms: Callable[[], Compose]
@@ -48,16 +70,17 @@ class _StridedEnv(ParallelEnv):
 
 
 def parallel_env(
-    make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
+    make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose], num_envs: int
 ) -> ParallelEnv:
     """Return environments in worker processes, with the policy's transforms inside the workers.
 
-    Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of
-    ``n`` plays the episodes ``i, i + n, i + 2n, ...`` after ``set_seed(seed, static_seed=True)``.
+    Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of ``n``
+    plays the episodes of the seeds ``seed + i``, ``seed + i + n``, ... after ``set_seed(seed,
+    static_seed=True)``, and those of seed 0 before it: it seeds its environment at every reset.
 
     Args:
-        make_env: builds an environment, called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker,
-            see :class:`~warmprior.envs.RobosuiteEnv`.
+        make_env: builds an environment, called without arguments in each worker. It must start the same
+            episode after every ``set_seed(seed)``.
         make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
         num_envs: number of workers, at least 1.
 
@@ -66,18 +89,13 @@ def parallel_env(
         >>> from warmprior import PastPrior, policy_transforms
         >>> from warmprior.envs import NavigationEnv
         >>> from warmprior.evaluation import parallel_env
-        >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
-        ...     return NavigationEnv()
         >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)
-        >>> env = parallel_env(make_env, make_transforms, num_envs=2)
+        >>> env = parallel_env(NavigationEnv, make_transforms, num_envs=2)
         >>> env.batch_size, env.is_closed  # the workers start with the first reset
         (torch.Size([2]), True)
     """
     check_whole_numbers(num_envs=num_envs)
-    workers = [
-        partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
-        for i in range(num_envs)
-    ]
+    workers = [partial(_transformed, make_env, make_transforms, i, num_envs) for i in range(num_envs)]
     # No shared buffers: with them the parent polls, and takes a core from the workers.
     env = _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
     env.make_transforms = make_transforms
@@ -110,7 +128,7 @@ def watched(env: EnvBase) -> Iterator[None]:
         base.start()
     workers = list(base._workers) if isinstance(base, ParallelEnv) else []
     finished = threading.Event()
-    dead = ""
+    dead, code = "", 0
     # TorchRL closes the other processes when it finds a dead worker, and closed ones raise ValueError.
     closed_by_torchrl = suppress(ValueError)
 
@@ -120,7 +138,7 @@ def watched(env: EnvBase) -> Iterator[None]:
                 call(worker)
 
     def look() -> None:
-        nonlocal dead
+        nonlocal dead, code
         ended = []
         for i, worker in enumerate(workers):
             with closed_by_torchrl:
@@ -151,9 +169,9 @@ def watched(env: EnvBase) -> Iterator[None]:
             env.close(raise_if_closed=False)
         except Exception:  # closing fails if workers are dead
             each(lambda worker: worker.terminate())
-        if dead:
+        if dead and not isinstance(error, KeyboardInterrupt):
             raise dead_worker_error(
-                dead, "run one environment in this process to see its own error"
+                dead, "run one environment in this process to see its own error", code
             ) from error
         raise
     finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
@@ -21,17 +20,5 @@ def row_seeding(env: EnvBase) -> Callable[[int, int], None]:
             "single environments into a SerialEnv, a ParallelEnv or parallel_env; or, if set_seed(seed, "
             "static_seed=True) lets row i play seed + i, seed + i + n, ..., set strided_seeds in its class"
         )
-
-    for make_env, options in zip(base.create_env_fn, base.create_env_kwargs, strict=True):
-        if _has_offset(make_env) or options.get("seed_offset"):
-            raise ValueError("leave out seed_offset, or build the environments by parallel_env")
     rows = [base[row] for row in range(env.batch_size[0])]
     return lambda row, seed: rows[row].set_seed(seed, static_seed=True)
-
-
-def _has_offset(make_env: object) -> bool:
-    # Looked up here and not in the workers, because a worker without the attribute dies.
-    if not isinstance(make_env, partial):
-        return False
-    inner = (make_env.func, *make_env.args, *make_env.keywords.values())
-    return bool(make_env.keywords.get("seed_offset")) or any(map(_has_offset, inner))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -25,8 +26,10 @@ class WorkerError(RuntimeError):
     """
 
 
-def dead_worker_error(worker: str, advice: str) -> WorkerError:
-    """Return the error with the worker that died, the likely reason, and advice."""
+def dead_worker_error(worker: str, advice: str, code: int | None = None) -> WorkerError:
+    """Return the error with the worker that died, the likely reason by its exit code, and advice."""
+    if code is not None and code > 0:
+        return WorkerError(f"{worker} died of an error of its own: {advice}.")
     return WorkerError(
         f"{worker} died. It may have been killed for lack of memory; use fewer workers, or {advice}."
     )
@@ -60,9 +63,13 @@ def stop_forking() -> None:
 
 
 def end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly; a main process goes on."""
+    """Let this process end when the one that started it dies, however abruptly; a main process goes on.
+
+    Ctrl-C, which a terminal sends to all processes, is left to the one that started it.
+    """
     if multiprocessing.parent_process() is None:
         return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = os.getppid()
 
     def watch() -> None:

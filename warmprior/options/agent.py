@@ -52,7 +52,8 @@ class PriorSpaceConfig:
             ``reward_offset * H / (R * d_a * log 2)``: otherwise the entropy of further decisions is worth
             more than success until the temperature has fallen.
         target_entropy: target of the entropy, in units of the box.
-        reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
+        reward_offset: number subtracted from every control step's reward; DSRL turns 0/1 into -1/0. If
+            failure ends episodes, take 0: an early failure would cost less than a late success.
         evaluate_every: control steps between evaluations (and saves).
         evaluation_episodes: episodes per evaluation of the greedy agent.
         seed: seed of all random draws.

@@ -110,7 +110,7 @@ class PriorSpaceAgent:
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Make the updates for one vector step of the environment, each on its own batch.
 
-        Returns the critic's loss ``"q"`` and the temperature ``"alpha"`` of the last update. Raises
+        Returns the critic's loss ``"q_loss"`` and the temperature ``"alpha"`` of the last update. Raises
         FloatingPointError if a loss is NaN or infinite, before it changes anything, and ValueError if the
         losses cannot be compiled.
         """
@@ -129,7 +129,7 @@ class PriorSpaceAgent:
             if "loss_qvalue" in losses:
                 self._updater.step()
             values |= {k: v.detach() for k, v in result.items()}
-        return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
+        return {"q_loss": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
         # Without the frozen policy, and without buffers other than the target critics'.

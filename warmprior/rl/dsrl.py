@@ -35,7 +35,7 @@ from warmprior.transforms.inner_step import rows_where
 type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2
-"""The number of critics of each kind; the smaller of their values is used."""
+"""The number of critics of each kind if one is given to copy; the smallest of their values is used."""
 
 STEPS = "steps_to_next_obs"
 """TorchRL's key of the decisions up to the next state, which its ``MultiStep`` writes."""
@@ -177,8 +177,12 @@ class DSRLNALoss(LossModule):
         self.reduction = "mean"
         self.distillation = ResidualSampler(decoder)
         self.convert_to_functional(actor_network, "actor_network")
-        self.convert_to_functional(qvalue_network, "qvalue_network", CRITICS, create_target_params=True)
-        self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", CRITICS)
+        number, noise_number = (
+            len(critics) if isinstance(critics, list) else CRITICS
+            for critics in (qvalue_network, noise_qvalue_network)
+        )
+        self.convert_to_functional(qvalue_network, "qvalue_network", number, create_target_params=True)
+        self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", noise_number)
         log_alpha = torch.tensor(math.log(alpha_init), device=self._default_device)
         self.log_alpha = nn.Parameter(log_alpha)
         self.register_buffer("target_entropy", torch.full_like(log_alpha, target_entropy))
@@ -335,6 +339,7 @@ class DSRLNALoss(LossModule):
 
     def _values(self, data: TensorDictBase) -> Tensor:
         key = self.tensor_keys.state_action_value
+        check_keys(data, [key], "DSRLNALoss", ": a critic must write it (ValueOperator(..., out_keys=[...]))")
         values = data[key]
         check_shape(f"a critic's {key!r}", values, (*values.shape[:-1], 1))
         return values.squeeze(-1)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.transforms import Compose
 
-from warmprior.checks import check_whole_numbers
+from warmprior import keys
+from warmprior.checks import check_keys, check_whole_numbers
 from warmprior.evaluation.episodes import evaluate
 from warmprior.evaluation.parallel import parallel_env
 from warmprior.io.workers import torch_threads
@@ -20,6 +21,8 @@ from warmprior.options.agent import IMPROVE, NUM_ENVS, PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
+from warmprior.transforms.policy import policy_transforms
+from warmprior.transforms.success_reward import rewarded_by_success
 
 APART = 5_000
 """The distance between the seeds of episodes that are reported, that choose an agent, and that confirm it."""
@@ -31,6 +34,7 @@ class Improvement:
 
     Attributes:
         policy: the improved policy, or the frozen one if no agent was better.
+        improved: True if an agent was better.
         before: solved episodes of the frozen policy.
         after: solved episodes of ``policy``.
         episodes: number of episodes of each, from the same starts, by which nothing was chosen.
@@ -40,12 +44,13 @@ class Improvement:
     Examples:
         >>> from warmprior import Improvement, PastPrior, VelocityMLP, WarmPriorActor
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
-        >>> result = Improvement(actor, before=40, after=90, episodes=100, reach=0.1, curve=[])
+        >>> result = Improvement(actor, True, before=40, after=90, episodes=100, reach=0.1, curve=[])
         >>> result.after > result.before
         True
     """
 
     policy: WarmPriorActor
+    improved: bool
     before: int
     after: int
     episodes: int
@@ -57,8 +62,7 @@ def improve_policy(
     policy: WarmPriorActor,
     directory: str | Path,
     *,
-    make_env: Callable[..., EnvBase] | None = None,
-    make_transforms: Callable[[], Compose] | None = None,
+    make_env: Callable[[], EnvBase] | None = None,
     num_envs: int = NUM_ENVS,
     config: PriorSpaceConfig | None = None,
     episodes: int = 100,
@@ -67,10 +71,11 @@ def improve_policy(
 ) -> Improvement:
     """Improve a policy by reinforcement learning in its source space.
 
-    The policy stays frozen, and an agent learns where its flow starts (:class:`PriorSpaceTraining`). The
-    environment's reward is that of the task: 1 where a control step solves it, else 0. The best agent of the
-    evaluations is kept if it also solves more of other episodes, as the best of several is better by chance
-    alone. The policies before and after then play a third set: that of ``python -m warmprior evaluate``.
+    The policy stays frozen, and an agent learns where its flow starts (:class:`PriorSpaceTraining`). Success
+    is the reward, whatever the environment's own is: 1 for a control step at which the task is solved, else
+    0, less the recipe's ``reward_offset``. The best agent of the evaluations is kept if it also solves more
+    of other episodes, as the best of several is better by chance alone. The policies before and after then
+    play a third set: that of ``python -m warmprior evaluate``.
 
     The updates use as many threads as PyTorch had before, while the workers wait. One seed repeats bit for
     bit with the same number of threads.
@@ -78,12 +83,13 @@ def improve_policy(
     Args:
         policy: the policy, such as one of :func:`~warmprior.saving.load_policy`. It must solve some
             episodes: where it solves none, there is no reward to learn from.
-        directory: folder of the training, which continues where it was interrupted.
+        directory: folder of the training, which continues where it was interrupted. It knows the policy and
+            the recipe, and cannot tell one environment of yours from another: take another folder.
 
     Keyword Args:
-        make_env: builds the environment, called as for :func:`~warmprior.evaluation.parallel_env`; by default
-            the environment that the policy was made for, rewarded by its success.
-        make_transforms: builds the policy's transforms for ``make_env``.
+        make_env: builds an environment in raw units that writes ``"success"`` and ends its episodes, such as
+            :func:`~warmprior.envs.gym_env`'s; see :func:`~warmprior.evaluation.parallel_env`. By default the
+            environment that the policy was made for.
         num_envs: environments in worker processes.
         config: the recipe; by default :data:`~warmprior.options.agent.IMPROVE`, at the policy's own number of
             network evaluations.
@@ -92,47 +98,44 @@ def improve_policy(
         description: label of the progress bars; none if ``None``.
 
     Raises:
-        ValueError: if the policy keeps no description of an environment with a success and ``make_env`` is
-            missing, the policy is guided, is trained at ``t = 0`` only or sees images, or the recipe does not
-            fit it.
+        KeyError: if the environment writes no ``"success"``.
+        ValueError: if the policy keeps no description of an environment and ``make_env`` is missing, the
+            policy is guided, is trained at ``t = 0`` only or sees images, or the recipe does not fit it.
         FloatingPointError: if the training diverges; the last save stays.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from functools import partial
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import NavigationEnv
         >>> from warmprior import PriorSpaceConfig, improve_policy
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
         >>> config = PriorSpaceConfig(
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
         ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
-        >>> def make_env(seed_offset, seed_stride):
-        ...     return NavigationEnv((1, 1))
-        >>> transforms = partial(policy_transforms, actor)
         >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
-        ...     result = improve_policy(actor, folder, make_env=make_env, make_transforms=transforms,
-        ...                             num_envs=2, config=config, episodes=4)
+        ...     result = improve_policy(actor, folder, make_env=lambda: NavigationEnv((1, 1)), num_envs=2,
+        ...                             config=config, episodes=4)
         >>> result.before, result.after  # doctest: +SKIP
         (0, 0)
     """
     # Only here, because the package is imported without its environments.
-    from warmprior.envs.description import environment_parts, is_registered
+    from warmprior.envs.description import environment_parts
     from warmprior.options.defaults import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
     check_improvable(policy)
-    if make_env is None:
-        make_env, make_transforms = environment_parts(policy, by_success=True)
-        if is_registered(policy.environment):
-            make_env().close()  # an error is better raised here than in a worker
-    elif make_transforms is None:
-        raise ValueError("make_env needs make_transforms, such as partial(policy_transforms, policy)")
-    builders = make_env, make_transforms
     config = replace(IMPROVE, nfe=policy.sampling.evaluations()) if config is None else config
-
     if max(episodes, config.evaluation_episodes) > APART:
         raise ValueError(f"more than {APART} episodes would choose and report by the same ones")
+    if make_env is None:
+        make_env, make_transforms = environment_parts(policy)
+    else:
+        make_transforms = partial(policy_transforms, policy)
+    single = make_env()  # an error is better raised here than in a worker
+    hint = ": success is the reward (gym_env(env, success=NAME) reads it from info)"
+    check_keys(single.observation_spec, [keys.SUCCESS], "the environment of an agent", hint)
+    single.close()
+    builders = make_env, partial(rewarded_by_success, make_transforms)
 
     def environment(seed: int) -> EnvBase:
         # Outside of the workers one anchor draws for all environments.
@@ -152,7 +155,8 @@ def improve_policy(
             compile=compile,
         )
         curve = training.run()
-        frozen, improved = policy.replace(nfe=config.nfe), training.policy()
+        frozen, best = policy.replace(nfe=config.nfe), training.policy()
+        improved = best.start is not frozen.start
         env = parallel_env(*builders, num_envs)
 
         def solved(played: WarmPriorActor, first_seed: int, name: str) -> int:
@@ -161,12 +165,13 @@ def improve_policy(
             outcomes = evaluate(played, env, episodes=episodes, first_seed=first_seed, **options)
             return sum(outcome.success for outcome in outcomes)
 
-        if improved.start is not frozen.start:
+        if improved:
             confirming = EVALUATION_SEED + 2 * APART
-            counts = [solved(played, confirming, "confirm") for played in (frozen, improved)]
-            improved = improved if counts[1] > counts[0] else frozen
+            counts = [solved(played, confirming, "confirm") for played in (frozen, best)]
+            improved = counts[1] > counts[0]
         before = after = solved(frozen, EVALUATION_SEED, "before")
-        if improved is not frozen:
-            after = solved(improved, EVALUATION_SEED, "after")
+        if improved:
+            after = solved(best, EVALUATION_SEED, "after")
         env.close(raise_if_closed=False)
-    return Improvement(improved, before, after, episodes, training.reach(), curve)
+    kept = best if improved else frozen
+    return Improvement(kept, improved, before, after, episodes, training.reach(), curve)

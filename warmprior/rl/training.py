@@ -122,6 +122,7 @@ class PriorSpaceTraining:
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
         self._best: dict[str, torch.Tensor] = {}
+        self._warned = False
         self.identity = {
             "config": asdict(config),
             "prior": actor.prior.config(),
@@ -168,6 +169,7 @@ class PriorSpaceTraining:
     def _run(self) -> None:
         config = self.config
         threads = torch.get_num_threads()  # TorchRL takes those of workers off, which wait during updates
+        reach = 0.0
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
@@ -195,7 +197,8 @@ class PriorSpaceTraining:
                 if not self.curve[0]["successes"]:
                     warnings.warn(
                         f"the policy solves none of {config.evaluation_episodes} episodes: an agent learns "
-                        "from successes, so train the policy on more demonstrations, or for longer",
+                        "from successes, so train the policy on more demonstrations, or for longer (if the "
+                        "environment writes success at all)",
                         stacklevel=3,
                     )
             while self.steps < config.environment_steps:
@@ -207,10 +210,11 @@ class PriorSpaceTraining:
                     if self._compiles:
                         bar.set_postfix_str("compiling the updates")
                         self._compiles = False
+                    reach = reach or self.reach()
                     with torch_threads(threads):
                         metrics = self.agent.learn(self.buffer)
                     last = {row["evaluation"]: row["success_rate"] for row in self.curve}
-                    bar.set_postfix(metrics | last, refresh=False)
+                    bar.set_postfix(metrics | {"reach": reach} | last, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises if the agent's state is not finite.
@@ -264,6 +268,7 @@ class PriorSpaceTraining:
         following = transitions["next"]
         reward = following["reward"].to(torch.get_default_dtype())  # that of the critics
         following["reward"] = reward - self.config.reward_offset * following[keys.EXECUTED]
+        self._check_failures(data["next"])
         following["terminated"] = following["done"].clone()  # DSRL treats time-outs as terminations
         # Checked before saving, since a saved NaN would end every later training.
         self._check_finite(transitions)
@@ -274,6 +279,20 @@ class PriorSpaceTraining:
     def _check_finite(self, data: TensorDictBase) -> None:
         cause = "the policy or the training has diverged, or the environment is at fault"
         check_finite(dict(data.items(True, True)), cause)
+
+    def _check_failures(self, after: TensorDictBase) -> None:
+        """Warn once if episodes end in failure while every control step costs something."""
+        solved = after.get(keys.SUCCESS, None)
+        if self._warned or self.config.reward_offset <= 0 or solved is None:
+            return
+        if (after["terminated"] & ~solved.bool()).any():
+            self._warned = True
+            warnings.warn(
+                f"episodes end in failure, and reward_offset={self.config.reward_offset:g} is the cost of a "
+                "control step: an early failure costs less than a late success. Take reward_offset=0 with a "
+                "small alpha_init",
+                stacklevel=2,
+            )
 
     def _check_executed(self, after: TensorDictBase) -> None:
         """Raise ValueError for partly executed chunks, because critics judge whole chunks only."""
