@@ -88,13 +88,13 @@ print(len(episodes), "episodes of", len(episodes[0]["actions"]), "steps")
 # As an HDF5 file
 # ---------------
 # robomimic's layout takes ten lines: a group per demonstration with ``actions``, ``rewards`` and
-# observations by name, and the environment's name in an attribute. :doc:`/data` has the whole
-# format.
+# observations by name, and the environment's name in an attribute, whose type is 1 for robosuite
+# and 2 for Gymnasium. :doc:`/data` has the whole format.
 
 with h5py.File(root / "swing_up.hdf5", "w") as file:
     data = file.create_group("data")
     data.attrs["env_args"] = json.dumps(
-        {"env_name": "Pendulum-v1", "env_kwargs": {}}
+        {"env_name": "Pendulum-v1", "type": 2, "env_kwargs": {}}
     )
     for i, episode in enumerate(episodes):
         demo = data.create_group(f"demo_{i}")

@@ -114,7 +114,10 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
             register_mimicgen()
     if name not in robosuite.ALL_ENVIRONMENTS:
         names = ", ".join(sorted(robosuite.ALL_ENVIRONMENTS))
-        raise ImportError(f"robosuite has no environment {name!r}: import its package first; it has {names}")
+        raise ImportError(
+            f"robosuite has no environment {name!r}: import its package first, or write type=2 in env_args "
+            f"for an environment of Gymnasium's; it has {names}"
+        )
     kwargs = dict(env_args["env_kwargs"])
     kwargs.update(
         has_renderer=False,
