@@ -1,6 +1,7 @@
 import functools
 import gc
 import multiprocessing
+import os
 import pickle
 import traceback
 from concurrent.futures import Future
@@ -31,7 +32,7 @@ def apart(function):
 
         def work():
             gc.freeze()  # what has threads, as video decoders have, ends in the process that they are in
-            end_with_parent()
+            end_with_parent(os.getppid())
             torch.set_num_threads(1)  # it would wait for those of the process before, which are not here
             try:
                 outcome = function(*args, **kwargs), None

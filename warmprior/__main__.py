@@ -267,8 +267,8 @@ def improve(
         f"{config.gamma:g} per chunk, NFE {config.nfe}",
         flush=True,
     )
-    absolute = Path(folder).absolute()
-    place = out / f"{absolute.parent.name}-{absolute.name}-{algorithm}-seed{seed}"
+    whole = Path(folder).resolve()
+    place = out / f"{whole.parent.name}-{whole.name}-{algorithm}-seed{seed}"
     options: Any = {"num_envs": num_envs, "config": config, "compile": compile, "episodes": episodes}
     result = improve_policy(actor, place, **options)
     save_policy(result.policy, place / "policy")

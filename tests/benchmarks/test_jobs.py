@@ -205,7 +205,7 @@ def fail():
 
 def resumed(out, argv):
     """Run a command line on what an earlier call left, with a log."""
-    end_with_parent()
+    end_with_parent(os.getppid())
     resume = ["--resume"] if (out / "options.json").exists() else []
     with (out.parent / "log.txt").open("a", buffering=1) as log:
         os.dup2(log.fileno(), 1), os.dup2(log.fileno(), 2)

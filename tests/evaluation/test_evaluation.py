@@ -3,9 +3,12 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ from torchrl.envs import (
 
 from tests.envs.test_gymnasium import Dial, registered_dial
 from tests.errors import raises, refuses
-from tests.processes import ended
+from tests.processes import apart, ended
 from tests.toy_env import ACTION_DIM, CountingEnv, closing, mlp_actor
 from warmprior import (
     GaussianPrior,
@@ -398,6 +401,46 @@ def test_a_worker_with_an_error_of_its_own_was_not_out_of_memory():
     with raises(WorkerError, "worker", "exit code 1", "error of its own") as caught:
         evaluate(actor_for(), env, episodes=2, first_seed=0)
     assert "memory" not in str(caught.value)
+
+
+ROLLOUT = """
+from functools import partial
+from warmprior import PastPrior, policy_transforms
+from warmprior.envs import NavigationEnv
+from warmprior.evaluation import parallel_env
+env = parallel_env(NavigationEnv, partial(policy_transforms, PastPrior(8), observation_steps=1), 2)
+env.reset()
+print("started", flush=True)
+END
+"""
+
+
+@pytest.mark.parametrize("end", ["while True: env.rollout(2)", "raise LookupError"])
+def test_a_program_with_workers_ends(end):
+    """Ctrl-C reaches all processes of a terminal; an error of the program's own leaves workers open."""
+    program = [sys.executable, "-W", "ignore", "-c", ROLLOUT.replace("END", end)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(program, cwd=Path(__file__).parents[2], **pipes) as process:
+        assert process.stdout.readline() == "started\n"
+        if "rollout" in end:
+            time.sleep(0.5)
+            os.killpg(process.pid, signal.SIGINT)
+        try:
+            _, said = process.communicate(timeout=20)
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert said.rstrip().endswith("KeyboardInterrupt" if "rollout" in end else "LookupError")
+
+
+@apart
+def test_the_caller_of_workers_still_hears_an_interrupt():
+    """TorchRL builds an environment in the caller too, which may be another process's child."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    env = environments(1)
+    env.reset()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    env.close()
 
 
 def test_an_interrupt_reaches_the_caller_and_no_worker():

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import SerialEnv
 
 from tests.envs.test_gymnasium import registered_dial
@@ -129,6 +130,20 @@ def test_success_is_the_reward_whatever_the_environment_s_own_is(tmp_path):
         improve_policy(actor, tmp_path / "none", make_env=partial(CountingEnv, 6), **options)
 
 
+@pytest.mark.parametrize("shape", [(2,), (2, 1)])
+@pytest.mark.parametrize("failing", [None, 0, 1])
+def test_an_episode_that_was_solved_earlier_does_not_end_in_failure(tmp_path, recwarn, failing, shape):
+    """By hand: two episodes of three decisions, solved at the first or second, but for the failing one."""
+    training = make_training(tmp_path)
+    solved = [[True, False], [False, True], [False, False]]
+    for decision, flags in enumerate(solved * 2):
+        flags = torch.tensor([flag and row != failing for row, flag in enumerate(flags)])
+        ends = torch.full((2, 1), decision % 3 == 2)
+        after = TensorDict({"success": flags.view(shape), "terminated": ends, "done": ends}, [2])
+        training._check_failures(after)
+    assert len([w for w in recwarn if "reward_offset" in str(w.message)]) == (failing is not None)
+
+
 @pytest.mark.parametrize("offset", [1.0, 0.0])
 @pytest.mark.parametrize("truncate", [True, False])
 def test_failures_that_end_episodes_are_said_to_be_cheap(tmp_path, recwarn, truncate, offset):
@@ -174,7 +189,7 @@ def test_an_agent_that_is_no_better_on_other_episodes_is_not_kept(tmp_path, monk
     options = {"make_env": make_env, "num_envs": 2, "description": None}
     result = improve_policy(actor, tmp_path, config=make_config(environment_steps=60), episodes=4, **options)
     kept = confirmed[1] > confirmed[0]
-    assert (result.policy is lucky) is kept and (result.before, result.after) == (3, 3)
+    assert (result.policy is lucky) is result.improved is kept and (result.before, result.after) == (3, 3)
     assert len(policies) == 3 + kept and policies[1] is lucky
     assert len({*seeds[:2]}) == 1 and seeds[2] == 10_000_000 and seeds[0] > 10_000_000 + 4
 

@@ -137,6 +137,33 @@ def test_what_no_chunk_can_be():
         TransformedEnv(number, ChunkStep(2)).rollout(1, ones(2))
 
 
+class Solved(CountingEnv):
+    """Solved at its second, sixth and seventh step; its own reward is the step's number."""
+
+    def __init__(self, length=7):
+        super().__init__(length)
+        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+
+    def _seen(self, out):
+        return out.set("success", torch.tensor([self.t in (2, 6, 7)]))
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.5])
+@pytest.mark.parametrize("length", [4, 7])
+def test_a_reward_by_success_pays_every_solved_step(length, gamma):
+    base = SerialEnv(2, [Solved, partial(Solved, length)])
+    for counter in ([], [StepCounter()]):  # which counts every step, so no transform may wait
+        env = TransformedEnv(base, Compose(*counter, ChunkStep(3, gamma=gamma, by_success=True)))
+        check_env_specs(env)
+        rollout = env.rollout(3, ones(3), break_when_any_done=False)["next"]
+        assert (env.transform[-1]._inner_step()[1] is None) == bool(counter)
+        reward = rollout[1]["reward"].flatten()
+        third = {4: gamma, 7: 1.0}[length]  # of length 4 it is the next episode's first decision
+        assert reward.tolist() == pytest.approx([gamma, {4: 0.0, 7: gamma**2}[length], third])
+    with raises(KeyError, "success", "by_success"):
+        TransformedEnv(CountingEnv(7), ChunkStep(3, by_success=True)).reset()
+
+
 @pytest.mark.parametrize("place", ["single", "outside"])
 def test_an_event_at_any_executed_step_is_one_of_the_chunk(place):
     class Events(CountingEnv):

@@ -88,7 +88,7 @@ def robosuite_parts(
 
 def environment_parts(
     actor: WarmPriorActor,
-) -> tuple[Callable[..., EnvBase], Callable[[], Compose]]:
+) -> tuple[Callable[..., EnvBase], Callable[..., Compose]]:
     """Return a builder of the environment that a policy was made for, and one of the policy's transforms.
 
     Raises ValueError if the policy keeps no description of an environment.
@@ -106,19 +106,26 @@ def environment_parts(
             "trained on demonstrations alone. Build your environment with policy_transforms(actor), or give "
             "improve_policy a make_env; for a robot see docs/your_robot.md"
         )
+    return make_env, partial(transforms_builder(actor), **adapters)
+
+
+def transforms_builder(actor: WarmPriorActor) -> Callable[..., Compose]:
+    """Return a builder of a policy's transforms that other processes can use as well.
+
+    It holds what the transforms need of the policy, and not its network. Its arguments are further ones of
+    :func:`policy_transforms`.
+    """
     normalizer = copy.deepcopy(actor.normalizer)
-    transforms = partial(
+    return partial(
         policy_transforms,
         actor.prior,
         # The environments' normaliser stays on the CPU, even if the policy moves to a GPU.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
-        **adapters,
         observation_steps=getattr(uncompiled(actor.network), "observation_steps", None),
         see_history=actor.sees_history,
         # A guided policy reads the delay's key.
         delay=None if actor.ode.guidance is None else 0,
     )
-    return make_env, transforms
 
 
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:

@@ -39,7 +39,7 @@ class _Infos(BaseInfoDictReader):
     def __init__(self, success: str | None, measures: Sequence[str]) -> None:
         self.success, self._measures = success, list(measures)
         self.present: set[str] = set()
-        """The names that were in ``info`` so far."""
+        """The names that were in ``info`` of the last call."""
 
     @property
     def info_spec(self) -> Composite:
@@ -48,7 +48,7 @@ class _Infos(BaseInfoDictReader):
         return Composite(numbers | flag)
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
-        self.present.update(info_dict)
+        self.present = set(info_dict)
         for name in self._measures:
             value = torch.as_tensor(info_dict.get(name, 0), dtype=torch.float32)
             tensordict.set(name, value.reshape(1))
@@ -64,25 +64,27 @@ class _Gym(GymWrapper):
     _seed: int | None = None
     ends_at_success = False
     infos: _Infos | None = None
+    told: set[str] | None = None
+    """The names that ``info`` had after steps, until success was among them or found missing."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         result = super()._step(tensordict)
         if self.ends_at_success and result[SUCCESS].any():
             for flag in ("terminated", "done"):
                 result.set(flag, torch.ones_like(result[flag]))
-        if self.infos is not None and self.infos.success is not None and result["done"].any():
-            self._check_success(self.infos.success, self.infos.present)
+        if self.infos is not None and self.told is not None:
+            self._check_success(self.infos.success, self.told | self.infos.present, result["done"].any())
         return result
 
-    def _check_success(self, success: str, present: set[str]) -> None:
-        """Warn of a success that info did not have in a whole episode."""
-        if success not in present:
+    def _check_success(self, success: str | None, told: set[str], done: Any) -> None:
+        """Warn of a success that info did not have in the first episode."""
+        self.told = None if success in told or done else told
+        if success not in told and done:
             warnings.warn(
                 f"info had no {success!r} in a whole episode, so it counts as not solved; it had "
-                f"{sorted(present)}: name the entry that tells success",
+                f"{sorted(told)}: name the entry that tells success",
                 stacklevel=2,
             )
-            present.add(success)  # once
 
     def read_obs(self, observations: Any) -> dict[str, Any]:
         # An environment may write all its observations into one buffer.
@@ -96,7 +98,7 @@ class _Gym(GymWrapper):
         if hidden := sorted(returned & set(written.keys())):
             raise ValueError(
                 f"the entries {hidden} of info would replace the environment's own: rename them in info, or "
-                "leave them out of success and measures"
+                "leave them out of measures (success is written under 'success')"
             )
         return self
 
@@ -159,7 +161,7 @@ def gym_env(
             "ParallelEnv one per worker, in place of a vector environment"
         )
     if entries:
-        base.infos = _Infos(success, measures)
+        base.infos, base.told = _Infos(success, measures), None if success is None else set()
         base.set_info_dict_reader(base.infos)
     base.ends_at_success = terminate_on_success and success is not None
     specs = {key: base.observation_spec[present[key]] for key in chosen}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -38,9 +39,13 @@ class _NumberedEnv(PolicyEnv):
 
 
 def _transformed(
-    make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose], first: int, number: int
+    make_env: Callable[[], EnvBase],
+    make_transforms: Callable[[], Compose],
+    first: int,
+    number: int,
+    parent: int,
 ) -> EnvBase:
-    end_with_parent()
+    end_with_parent(parent)  # TorchRL also builds one in the parent itself
     env = _NumberedEnv(make_env(), make_transforms())
     env.first, env.number, env._next = first, number, first
     return env
@@ -80,7 +85,7 @@ def parallel_env(
 
     Args:
         make_env: builds an environment, called without arguments in each worker. It must start the same
-            episode after every ``set_seed(seed)``.
+            episode after every ``set_seed(seed)``, and start no processes of its own.
         make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
         num_envs: number of workers, at least 1.
 
@@ -95,9 +100,11 @@ def parallel_env(
         (torch.Size([2]), True)
     """
     check_whole_numbers(num_envs=num_envs)
-    workers = [partial(_transformed, make_env, make_transforms, i, num_envs) for i in range(num_envs)]
-    # No shared buffers: with them the parent polls, and takes a core from the workers.
-    env = _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+    common = make_env, make_transforms
+    workers = [partial(_transformed, *common, i, num_envs, os.getpid()) for i in range(num_envs)]
+    # No shared buffers: with them the parent polls, and takes a core from the workers. Daemons, because
+    # Python waits at its end for processes that are none.
+    env = _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False, daemon=True)
     env.make_transforms = make_transforms
     return env
 
@@ -160,6 +167,9 @@ def watched(env: EnvBase) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            each(lambda worker: worker.terminate())  # a step may take long
+            raise
         if isinstance(error, (ConnectionError, EOFError)):
             each(lambda worker: worker.join(0.2))  # TorchRL may notice before the process is reaped
         look()
@@ -169,7 +179,7 @@ def watched(env: EnvBase) -> Iterator[None]:
             env.close(raise_if_closed=False)
         except Exception:  # closing fails if workers are dead
             each(lambda worker: worker.terminate())
-        if dead and not isinstance(error, KeyboardInterrupt):
+        if dead:
             raise dead_worker_error(
                 dead, "run one environment in this process to see its own error", code
             ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
@@ -62,15 +61,14 @@ def stop_forking() -> None:
     _forks = False
 
 
-def end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly; a main process goes on.
+def end_with_parent(parent: int) -> None:
+    """Let this process end when the one that started it dies, however abruptly; ``parent`` itself goes on.
 
     Ctrl-C, which a terminal sends to all processes, is left to the one that started it.
     """
-    if multiprocessing.parent_process() is None:
+    if os.getpid() == parent:
         return
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:

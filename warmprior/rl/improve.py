@@ -21,8 +21,6 @@ from warmprior.options.agent import IMPROVE, NUM_ENVS, PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor
 from warmprior.rl.improved import check_improvable
 from warmprior.rl.training import PriorSpaceTraining
-from warmprior.transforms.policy import policy_transforms
-from warmprior.transforms.success_reward import rewarded_by_success
 
 APART = 5_000
 """The distance between the seeds of episodes that are reported, that choose an agent, and that confirm it."""
@@ -119,7 +117,7 @@ def improve_policy(
         (0, 0)
     """
     # Only here, because the package is imported without its environments.
-    from warmprior.envs.description import environment_parts
+    from warmprior.envs.description import environment_parts, transforms_builder
     from warmprior.options.defaults import EVALUATION_SEED
 
     check_whole_numbers(num_envs=num_envs, episodes=episodes)
@@ -130,12 +128,14 @@ def improve_policy(
     if make_env is None:
         make_env, make_transforms = environment_parts(policy)
     else:
-        make_transforms = partial(policy_transforms, policy)
+        make_transforms = transforms_builder(policy)
     single = make_env()  # an error is better raised here than in a worker
-    hint = ": success is the reward (gym_env(env, success=NAME) reads it from info)"
-    check_keys(single.observation_spec, [keys.SUCCESS], "the environment of an agent", hint)
-    single.close()
-    builders = make_env, partial(rewarded_by_success, make_transforms)
+    try:
+        hint = ": success is the reward (gym_env(env, success=NAME) reads it from info)"
+        check_keys(single.observation_spec, [keys.SUCCESS], "the environment of an agent", hint)
+    finally:
+        single.close()
+    builders = make_env, partial(make_transforms, by_success=True)
 
     def environment(seed: int) -> EnvBase:
         # Outside of the workers one anchor draws for all environments.

@@ -123,6 +123,7 @@ class PriorSpaceTraining:
         self.curve: list[dict[str, Any]] = []
         self._best: dict[str, torch.Tensor] = {}
         self._warned = False
+        self._solved: torch.Tensor | None = None  # which of the running episodes are
         self.identity = {
             "config": asdict(config),
             "prior": actor.prior.config(),
@@ -282,10 +283,14 @@ class PriorSpaceTraining:
 
     def _check_failures(self, after: TensorDictBase) -> None:
         """Warn once if episodes end in failure while every control step costs something."""
-        solved = after.get(keys.SUCCESS, None)
-        if self._warned or self.config.reward_offset <= 0 or solved is None:
+        flag = after.get(keys.SUCCESS, None)
+        if self._warned or self.config.reward_offset <= 0 or flag is None or self.collect is not None:
             return
-        if (after["terminated"] & ~solved.bool()).any():
+        done = after["done"]
+        solved = flag.bool().view_as(done)
+        solved = solved if self._solved is None else solved | self._solved
+        self._solved = solved & ~done
+        if (after["terminated"] & ~solved).any():
             self._warned = True
             warnings.warn(
                 f"episodes end in failure, and reward_offset={self.config.reward_offset:g} is the cost of a "

@@ -8,7 +8,6 @@ from warmprior.transforms.images import CameraImages, EncodeObservation
 from warmprior.transforms.normalize import normalizing_transforms
 from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.stack import ObservationStack
-from warmprior.transforms.success_reward import SuccessReward
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
 
 __all__ = [
@@ -21,7 +20,6 @@ __all__ = [
     "HistoryObservation",
     "InferenceDelay",
     "ObservationStack",
-    "SuccessReward",
     "WithheldHistory",
     "executed_chunk",
     "normalizing_transforms",

@@ -25,7 +25,7 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
-from warmprior.checks import check_between, check_choice, check_whole_numbers
+from warmprior.checks import check_between, check_choice, check_keys, check_whole_numbers
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import GROUP, EnvTransform, InnerStep, rows_where, set_aside
@@ -215,6 +215,8 @@ class ChunkStep(EnvTransform):
         gamma: discount per control step.
         success: key of a bool flag that is True after a chunk if it was True after any of its executed steps;
             ignored if the environment does not write it.
+        by_success: True rewards a control step with 1 if that flag is True then, and with 0 otherwise, in
+            place of the environment's own reward.
         measures: further keys (no states), each with ``"max"``, ``"sum"`` or ``"last"``: how its values over
             the executed steps become one per chunk. Sums of flags and whole numbers are int64.
         action_keys: keys of the environment's actions, vectors ``[*B, d_a]``.
@@ -225,7 +227,8 @@ class ChunkStep(EnvTransform):
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, ``gamma`` is not in [0, 1],
             an action is not a vector, a measure is combined in another way, or there are not as many chunk
             keys as action keys.
-        KeyError: if ``action_keys`` are not exactly the environment's actions.
+        KeyError: if ``action_keys`` are not exactly the environment's actions, or it lacks the success that
+            is to be its reward.
         RuntimeError: (at the first reset) if the environment has several rewards or no root ``"done"``, skips
             single steps, or restarts rows by itself so that the rest of a chunk would be executed in the next
             episode.
@@ -249,6 +252,7 @@ class ChunkStep(EnvTransform):
         prediction_length: int | None = None,
         gamma: float = 1.0,
         success: NestedKey = keys.SUCCESS,
+        by_success: bool = False,
         measures: Measures | None = None,
         action_keys: Sequence[NestedKey] = (keys.ACTION,),
         chunk_keys: Sequence[NestedKey] = (keys.CHUNK,),
@@ -267,7 +271,7 @@ class ChunkStep(EnvTransform):
             lengths = f"{execute}, {chunk_length} and {prediction_length}"
             raise ValueError(f"need execute <= chunk_length <= prediction_length, got {lengths}")
         self.chunk_length, self.execute, self.prediction_length = chunk_length, execute, prediction_length
-        self.gamma, self.success = gamma, unravel_key(success)
+        self.gamma, self.success, self.by_success = gamma, unravel_key(success), by_success
         check_measures(measures or {})
         self.measures = {key: how for key, how in (measures or {}).items() if how != "last"}
         self._input: TensorDictBase | None = None
@@ -320,6 +324,8 @@ class ChunkStep(EnvTransform):
                     "reads: ask for a reward's 'sum' (with gamma=1) and a state's 'last', or have the "
                     "environment write it under another key as well"
                 )
+            if self.by_success:
+                check_keys(parent.observation_spec, [self.success], "ChunkStep(by_success=True)")
             read = (*dones, rewards[0], self.success, *self.measures)
             inner.restarts.check(self.execute)
             parts = [part for transform in inner.transforms for part in flat(transform)]
@@ -404,7 +410,11 @@ class ChunkStep(EnvTransform):
             return [v if rows is None else torch.where(expand_as_right(rows, v), v, 0) for v, rows in pairs]
 
         # Combined before they are written, because the result of the last step is written into.
-        whole = {reward_key: self._return(terms(reward_key))}
+        rewards = terms(reward_key)
+        if self.by_success:
+            flags = zip(rewards, terms(self.success), strict=True)
+            rewards = [flag.view_as(reward).to(reward.dtype) for reward, flag in flags]
+        whole = {reward_key: self._return(rewards)}
         flagged = next_tensordict.get(self.success, None) is not None
         for key, how in ({self.success: "max", **self.measures} if flagged else self.measures).items():
             if how == "sum":

@@ -39,6 +39,7 @@ def policy_transforms(
     observation_key: NestedKey | None = None,
     action_key: NestedKey = keys.ACTION,
     success: NestedKey = keys.SUCCESS,
+    by_success: bool = False,
     measures: Measures | None = None,
 ) -> Compose:
     """Return the transforms between an environment and a :class:`~warmprior.WarmPriorActor`.
@@ -66,6 +67,7 @@ def policy_transforms(
         observation_key: key of the observation; by default the policy's, like the keys of history and chunk.
         action_key: key of the environment's action.
         success: see :class:`ChunkStep`.
+        by_success: see :class:`ChunkStep`.
         measures: see :class:`ChunkStep`.
 
     Raises:
@@ -117,6 +119,7 @@ def policy_transforms(
             prediction_length=prior.prediction_length,
             gamma=gamma,
             success=success,
+            by_success=by_success,
             measures=measures,
             action_keys=[action_key],
             chunk_keys=[chunk_key],

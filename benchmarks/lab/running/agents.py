@@ -18,7 +18,6 @@ from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.evaluation import parallel_env
 from warmprior.transforms import EncodeObservation
-from warmprior.transforms.success_reward import rewarded_by_success
 
 
 def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
@@ -47,7 +46,7 @@ def environment(
         transforms.append(PriorAnchor(actor))
         return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
     make_env, make_transforms = environment_parts(actor)
-    rewarded = partial(rewarded_by_success, make_transforms)
+    rewarded = partial(make_transforms, by_success=True)
     workers = parallel_env(partial(make_env, **options), rewarded, num_envs)
     # Outside of the workers, one anchor draws for all environments, and one encoder serves all.
     env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
