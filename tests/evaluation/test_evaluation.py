@@ -404,12 +404,15 @@ def test_a_worker_with_an_error_of_its_own_was_not_out_of_memory():
 
 
 ROLLOUT = """
+import signal
 from functools import partial
 from warmprior import PastPrior, policy_transforms
 from warmprior.envs import NavigationEnv
 from warmprior.evaluation import parallel_env
 env = parallel_env(NavigationEnv, partial(policy_transforms, PastPrior(8), observation_steps=1), 2)
 env.reset()
+# A shell starts what runs in the background without it, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 print("started", flush=True)
 END
 """
