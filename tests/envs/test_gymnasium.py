@@ -198,8 +198,8 @@ def test_a_success_that_info_never_has_is_said_once(tells, recwarn):
         def step(self, action):
             seen, *rest, _ = super().step(action)
             solved = self.at > 0.5
-            told = tells == "always" or (solved and tells == "when solved")
-            return seen, *rest, {"is_success": solved} if told else {}
+            present = tells == "always" or (solved and tells == "when solved")
+            return seen, *rest, {"is_success": solved} if present else {}
 
     env = gym_env(Telling(), success="is_success")
     env.set_seed(1)

@@ -38,8 +38,8 @@ class _Infos(BaseInfoDictReader):
 
     def __init__(self, success: str | None, measures: Sequence[str]) -> None:
         self.success, self._measures = success, list(measures)
-        self.present: set[str] = set()
-        """The names that were in ``info`` of the last call."""
+        self.names: set[str] = set()
+        """The names in the last ``info``."""
 
     @property
     def info_spec(self) -> Composite:
@@ -48,7 +48,7 @@ class _Infos(BaseInfoDictReader):
         return Composite(numbers | flag)
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
-        self.present = set(info_dict)
+        self.names = set(info_dict)
         for name in self._measures:
             value = torch.as_tensor(info_dict.get(name, 0), dtype=torch.float32)
             tensordict.set(name, value.reshape(1))
@@ -64,27 +64,25 @@ class _Gym(GymWrapper):
     _seed: int | None = None
     ends_at_success = False
     infos: _Infos | None = None
-    told: set[str] | None = None
-    """The names that ``info`` had after steps, until success was among them or found missing."""
+    step_names: set[str] | None = None
+    """The names in ``info`` after steps of the first episode, while success is not among them."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         result = super()._step(tensordict)
         if self.ends_at_success and result[SUCCESS].any():
             for flag in ("terminated", "done"):
                 result.set(flag, torch.ones_like(result[flag]))
-        if self.infos is not None and self.told is not None:
-            self._check_success(self.infos.success, self.told | self.infos.present, result["done"].any())
+        if self.infos is not None and self.step_names is not None:
+            names, success = self.step_names | self.infos.names, self.infos.success
+            ended, found = bool(result["done"].any()), success in names
+            self.step_names = None if ended or found else names
+            if ended and not found:
+                warnings.warn(
+                    f"info had no {success!r} in a whole episode, so it counts as not solved; it had "
+                    f"{sorted(names)}: choose the entry that is True once the task is solved",
+                    stacklevel=2,
+                )
         return result
-
-    def _check_success(self, success: str | None, told: set[str], done: Any) -> None:
-        """Warn of a success that info did not have in the first episode."""
-        self.told = None if success in told or done else told
-        if success not in told and done:
-            warnings.warn(
-                f"info had no {success!r} in a whole episode, so it counts as not solved; it had "
-                f"{sorted(told)}: name the entry that tells success",
-                stacklevel=2,
-            )
 
     def read_obs(self, observations: Any) -> dict[str, Any]:
         # An environment may write all its observations into one buffer.
@@ -161,7 +159,7 @@ def gym_env(
             "ParallelEnv one per worker, in place of a vector environment"
         )
     if entries:
-        base.infos, base.told = _Infos(success, measures), None if success is None else set()
+        base.infos, base.step_names = _Infos(success, measures), None if success is None else set()
         base.set_info_dict_reader(base.infos)
     base.ends_at_success = terminate_on_success and success is not None
     specs = {key: base.observation_spec[present[key]] for key in chosen}
