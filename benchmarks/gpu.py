@@ -187,7 +187,8 @@ def states(o: GpuOptions, seconds: float) -> dict[str, Any]:
     """Train from states, and play episodes."""
     from lab.running.comparison import EPISODES_PER_JOB
     from lab.running.jobs import Jobs
-    from lab.running.policies import Cell, play, row
+    from lab.running.measuring import row
+    from lab.running.policies import Cell, play
 
     options, policies = train_for(o, BEFORE_PLAYING * seconds, "state")
     last = policies[0].training.iterations

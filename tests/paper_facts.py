@@ -10,7 +10,7 @@ SIGMA = {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
 EVALUATION = {"nfe": (1, 3, 9), "episodes": 200, "seeds": 3, "top_k": 3, "chunk": (8,)}
 TRAINING = {
     # Architecture
-    "embedding_dim": 384,
+    "hidden_dim": 384,
     "num_layers": 8,
     "num_heads": 6,
     "timestep_embedding_dim": 128,

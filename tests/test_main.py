@@ -226,7 +226,7 @@ def test_a_network_of_ones_own_is_trained_and_imported_again(tmp_path, capsys, m
         assert "Straight" in capsys.readouterr().out
         for words, fact in (
             (["straight_networks:Crooked"], "Crooked"),
-            (["straight_networks:Straight", "--hidden-dim", "8"], "--hidden-dim"),
+            (["straight_networks:Straight", "--hidden-dim", "8"], "hidden_dim"),
         ):
             assert not missing(refused([*argv, *words], capsys), fact)
     finally:

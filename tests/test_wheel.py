@@ -132,7 +132,7 @@ import lerobot_policy_warmprior as plugin, warmprior
 from importlib.util import find_spec
 print(warmprior.__file__, plugin.__file__, find_spec("lab"))
 """
-TRAIN = """--policy.type=warm_flow --policy.prior=past,sigma=0.3 --policy.embedding_dim=24
+TRAIN = """--policy.type=warm_flow --policy.prior=past,sigma=0.3 --policy.hidden_dim=24
 --policy.num_layers=1 --policy.device=cpu --policy.push_to_hub=false --steps=2 --batch_size=4
 --num_workers=0 --save_freq=2 --dataset.root=data --dataset.repo_id=local/tiny --output_dir=run"""
 EVALUATE = """--policy.path=run/checkpoints/last/pretrained_model --policy.device=cpu

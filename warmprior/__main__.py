@@ -319,12 +319,11 @@ def train(
     from warmprior.tasks import Play, Task
     from warmprior.training import train_policy
     from warmprior.training.cloning import policy_path
-    from warmprior.training.networks import own_network
+    from warmprior.training.networks import check_network
     from warmprior.training.option_text import make
 
     check_device(run.device)  # before the demonstrations are read
-    if own_network(network) is not None and network.hidden_dim is not None:  # better raised here
-        raise ValueError(f"--hidden-dim does not reach {network.network}: write its options behind the name")
+    check_network(network)
     make(Prior, source.prior or DEFAULT_PRIOR, source.chunk)
     sampling = Sampling(nfe=evaluation.nfe, max_nfe=1 if training.times == "start" else None)
     demonstrations = open_demonstrations(

@@ -37,11 +37,12 @@ from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import delta_of
 from warmprior.training import NetworkOptions, TrainingConfig, make_network
 from warmprior.training.optim import ema_of, make_optimizer
+from warmprior.training.option_text import options_of
 
 PRIORS = {"gaussian": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
 SCRIPTS = ("robomimic", "curvature", "sigma", "chunking", "budget", "real_time_chunking", "pusht")
 MIMICGEN = {task: (f"{task}_d0", "source") for task in facts.MIMICGEN_TASKS}
-SIZES = ("embedding_dim", "num_layers", "num_heads", "timestep_embedding_dim")
+SIZES = ("hidden_dim", "num_layers", "num_heads", "timestep_embedding_dim")
 OPTIMIZER = {"learning_rate": "lr", "weight_decay": "weight_decay", "betas": "betas", "eps": "eps"}
 STATE, IMAGE = facts.TABLE_3["state"], facts.TABLE_3["image"]
 
@@ -143,6 +144,9 @@ def unlike_the_paper(presets):
     for part, options in other.items():
         if isinstance(options, dict):
             found |= {name: value for name, value in options.items() if value != paper[part][name]}
+            if text := found.pop("network", ""):
+                assert text.startswith(paper[part]["network"])
+                found |= options_of(text)
         else:
             assert options == paper[part]
     return found
@@ -222,8 +226,8 @@ def test_speed_is_measured_at_the_papers_sizes():
 
     from lab.speed.training import paper_network
 
-    widths = {PEERS["warmprior_transformer"][0], paper_network().embedding_dim}
-    assert widths == {STATE["embedding_dim"]} and STATE["observation_steps"] == timing.TO
+    widths = {PEERS["warmprior_transformer"][0], paper_network().hidden_dim}
+    assert widths == {STATE["hidden_dim"]} and STATE["observation_steps"] == timing.TO
     assert (facts.EVALUATION["nfe"], facts.EVALUATION["chunk"]) == (timing.NFES, (timing.H,))
 
 
@@ -344,7 +348,7 @@ def test_the_policy_for_lerobot():
     from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig, WarmupRatioConfig
 
     config = WarmFlowConfig()
-    names = ("embedding_dim", "num_layers", "num_heads", "dropout", "ema_rate")
+    names = ("hidden_dim", "num_layers", "num_heads", "dropout", "ema_rate")
     assert (
         IMAGE.items() >= values(config, (*names, "encoder", "image_size")).items()
         and config.crop_size is None

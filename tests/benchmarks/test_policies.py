@@ -11,7 +11,7 @@ from lab.options.command_line import parse
 from lab.options.presets import PRESETS
 from lab.running import jobs
 from lab.running import policies as common
-from lab.running.measuring import measure
+from lab.running.measuring import measure, row
 from lab.running.policies import Cell, play
 from tests.benchmarks import drift
 from tests.benchmarks.conftest import Inline
@@ -71,7 +71,7 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell):
     policies = policies_of(arguments(finished.parent / "new"))
     policy = next(p for p in policies if p.method.name == "past" and p.training.seed == 1)
     seeds = range(EVALUATION_SEED + 10_000, EVALUATION_SEED + 10_007)  # those of training seed 1
-    found = common.row(policy, cell, play(policy, cell, PRESETS["quick"].evaluation, seeds)[::-1], {})
+    found = row(policy, cell, play(policy, cell, PRESETS["quick"].evaluation, seeds)[::-1], {})
     assert (found["checkpoint"], found["nfe"]) == (20, 3) and found.get("execute") == cell.execute
     actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance, temperature=cell.temperature)
     played = {"execute": cell.execute, "delay": cell.delay, "success": "solved"}
@@ -203,6 +203,7 @@ def test_a_network_of_ones_own_is_found_in_a_fresh_process_and_trained_again_if_
     file.write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
     few = {"iterations": 1, "checkpoints": 1, "episodes": 1, "seeds": 1, "nfe": 1, "prior": "past"}
+    few["hidden_dim"] = None  # this network has no such option
     argv = arguments(tmp_path / "out", network=name, **few)
     try:
         assert robomimic.main(argv) == 0

@@ -44,7 +44,11 @@ def no_work(monkeypatch):
         ("robomimic", "--prior ot --batch-size 1", ("ot", "batch")),
         ("robomimic", f"--task {DRIFT}:task {DRIFT}:other", ("drift",)),
         ("robomimic", "--no-precondition --weighting standardised", ("--weighting velocity",)),
-        ("robomimic", "--network chi_transformer --hidden-dim 32", ("--hidden-dim 32", "num_heads")),
+        (
+            "robomimic",
+            "--network chi_transformer --hidden-dim 32",
+            ("--network chi_transformer", "hidden_dim=32", "num_heads"),
+        ),
         ("robomimic", "--objective l1 --prior past bridge", ("--objective l1", "bridge")),
         ("robomimic", "--times start --prior past", ("--times start", "past")),
         ("robomimic", "--ray-address 127.0.0.1:1", ("--ray-address", "--engine ray")),
@@ -79,7 +83,7 @@ def no_work(monkeypatch):
         ("prior_space_rl", "--preset unit --centre", ("--centre",)),
         ("robomimic", f"--preset much-ado --task {DRIFT}:task", ("--actions delta",)),
         ("robomimic", "--observations object", ("--observations", "--dataset")),
-        ("robomimic", f"{FILE} --observation-layers 2", ("observation_layers", "mlp")),
+        ("robomimic", f"{FILE} --network mlp,num_heads=2", ("--network mlp", "num_heads", "num_blocks")),
         ("robomimic", "--preset much", ("--preset", "quick, cpu, paper, much-ado", "'much'")),
         ("prior_space_rl", "--preset paper", ("--task",)),
         *(

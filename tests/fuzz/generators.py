@@ -110,7 +110,7 @@ def make_policies(folder: Path) -> None:
     data = TensorDict({"observation": torch.randn(50, 5), "action": torch.randn(50, 2)}, [50])
     networks = {
         "mlp": PreconditionedNetwork(VelocityMLP(2, 5, 3, 2, hidden_dim=16)),
-        "chi": ChiTransformer(2, 5, 3, embedding_dim=8, num_layers=1, num_heads=2),
+        "chi": ChiTransformer(2, 5, 3, hidden_dim=8, num_layers=1, num_heads=2),
     }
     for name, network in networks.items():
         actor = WarmPriorActor(network, PastPrior(3), nfe=2, clip=1.0, normalizer=Normalizer.fit(data))

@@ -54,7 +54,7 @@ def flow_policy(found, images=None, **options):
         inputs["observation.images.top"] = PolicyFeature(type=FeatureType.VISUAL, shape=images)
         options = {"encoder": "small", "image_size": 16, "crop_size": 12} | options
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
-    chosen = {"embedding_dim": 24, "num_layers": 1, "nfe": 1, "n_action_steps": 4, "device": "cpu"}
+    chosen = {"hidden_dim": 24, "num_layers": 1, "nfe": 1, "n_action_steps": 4, "device": "cpu"}
     kind, features = found["warm_flow"], {"input_features": inputs, "output_features": outputs}
     torch.manual_seed(0)
     return kind(kind.config_class(**features, **chosen | options))
@@ -73,7 +73,7 @@ def saved_flow_policy(found, folder, image=None):
 
     kind, named = found["warm_flow"], features(image)
     named["output_features"]["action"].shape = (2,)
-    small = {"embedding_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
+    small = {"hidden_dim": 32, "num_layers": 1, "num_heads": 2, "encoder": "small", "nfe": 2}
     small |= {"n_action_steps": 5, "prior_chunk": 8}  # fewer are executed than remembered
     config = kind.config_class(precondition=False, image_size=32, crop_size=28, **small, **named)
     torch.manual_seed(0)
@@ -112,7 +112,7 @@ def dataset_policy(found, root, episodes=None, place=None, streamed=False, **opt
     from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset
     from lerobot.policies.factory import make_policy
 
-    config = found["warm_flow"].config_class(embedding_dim=24, num_layers=1, device="cpu", **options)
+    config = found["warm_flow"].config_class(hidden_dim=24, num_layers=1, device="cpu", **options)
     config.pretrained_path = place
     kind = StreamingLeRobotDataset if streamed else LeRobotDataset
     dataset = kind("local/tiny", root=root, episodes=episodes)

@@ -127,7 +127,7 @@ def test_null_for_an_option_of_the_source(found, saved, option, tmp_path):
 
 def test_weights_of_another_size_are_named_in_one_line(found, saved, tmp_path):
     """As where a configuration lost an option, whose default is another."""
-    saved("warm_flow", embedding_dim=48)
+    saved("warm_flow", hidden_dim=48)
     with raises(ValueError, tmp_path, "size mismatch", "action_position", "...") as refused:
         load(found, "warm_flow", tmp_path)
     assert "\n" not in str(refused.value)
@@ -135,7 +135,7 @@ def test_weights_of_another_size_are_named_in_one_line(found, saved, tmp_path):
 
 def test_a_configuration_does_not_take_the_memory_of_a_network_without_weights(found, saved, tmp_path):
     for width in (24_000, 960_000):  # gigabytes, and terabytes
-        saved("warm_flow", embedding_dim=width, network="")
+        saved("warm_flow", hidden_dim=width, network="")
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         refuses(lambda: load(found, "warm_flow", tmp_path), ValueError, tmp_path, "far more weights")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
@@ -153,7 +153,7 @@ SOURCES = [("prior", "preview"), ("prior_chunk", 4)]
 CHANGES = {
     "warm_flow": [
         *(("precondition", False), ("num_layers", 2), ("num_heads", 3), ("n_obs_steps", 1)),
-        *(("embedding_dim", 48), ("prior_chunk", 8), ("prior", "gaussian"), ("prior", "past,sigma=0.1")),
+        *(("hidden_dim", 48), ("prior_chunk", 8), ("prior", "gaussian"), ("prior", "past,sigma=0.1")),
     ],
     "warm_pi05": [*SOURCES, ("sigma_unit", "std"), ("prior", "past,sigma=0.1")],
     "warm_smolvla": SOURCES,

@@ -153,7 +153,7 @@ def test_lerobots_own_loop_runs_a_policy_on_a_robot_of_a_package(tmp_path):
     ]
     data = ["--dataset.repo_id=local/arm", f"--dataset.root={tmp_path / 'arm'}"]
     run("lerobot-record", *robot, "--teleop.type=sim_leader", *data, *recorded)
-    network = "--policy.embedding_dim=32 --policy.num_layers=1 --policy.num_heads=2 --policy.encoder=small"
+    network = "--policy.hidden_dim=32 --policy.num_layers=1 --policy.num_heads=2 --policy.encoder=small"
     sizes = "--policy.image_size=32 --policy.crop_size=28 --policy.nfe=1 --policy.device=cpu"
     recipe = "--batch_size=4 --num_workers=0 --steps=3 --save_freq=3 --policy.push_to_hub=false"
     train = ["--policy.type=warm_flow", *network.split(), *sizes.split(), *recipe.split()]

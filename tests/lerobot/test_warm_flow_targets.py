@@ -57,7 +57,7 @@ def test_an_observation_that_is_its_own_target_is_refused_unless_it_is_named(fou
     kind = found["warm_flow"]
     for given, warned in (({}, True), (named, False)):
         caplog.clear()
-        config = kind.config_class(precondition=False, embedding_dim=24, num_layers=1, device="cpu", **given)
+        config = kind.config_class(precondition=False, hidden_dim=24, num_layers=1, device="cpu", **given)
         config.input_features, config.output_features = named["input_features"], policy.config.output_features
         kind(config, dataset_meta=dataset.meta)  # as from the factory, whose dataset fetches its steps later
         assert ("its own target" in caplog.text) is warned

@@ -25,7 +25,7 @@ class Linear(VelocityNetwork):
         return self.norm(self.layer(a + self.position))
 
 
-SMALL = {"embedding_dim": 12, "num_layers": 1, "num_heads": 3}
+SMALL = {"hidden_dim": 12, "num_layers": 1, "num_heads": 3}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_plain_mlp_is_four_layers_by_hand():
 
 
 SIZES = {VelocityMLP: "hidden_dim num_blocks", PlainMLP: "hidden_dim"}
-SIZES |= dict.fromkeys([AdaLNTransformer, ChiTransformer], "embedding_dim num_layers num_heads")
+SIZES |= dict.fromkeys([AdaLNTransformer, ChiTransformer], "hidden_dim num_layers num_heads")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from warmprior import AdaLNTransformer, ChiTransformer
 
 def tiny(length=4, steps=2, kind=ChiTransformer, **options):
     torch.manual_seed(0)
-    return kind(2, 3, length, steps, embedding_dim=24, num_layers=2, num_heads=3, **options).eval()
+    return kind(2, 3, length, steps, hidden_dim=24, num_layers=2, num_heads=3, **options).eval()
 
 
 @pytest.mark.parametrize("length", [1, 8])
@@ -132,8 +132,8 @@ def test_the_time_has_the_frequencies_of_the_option(make, options):
 
 @pytest.mark.parametrize("kind", [AdaLNTransformer, ChiTransformer])
 def test_options_out_of_range(kind):
-    with raises(ValueError, "num_heads", "embedding_dim", 5, 24):
-        kind(2, 3, 4, embedding_dim=24, num_heads=5)
+    with raises(ValueError, "num_heads", "hidden_dim", 5, 24):
+        kind(2, 3, 4, hidden_dim=24, num_heads=5)
     for name, values in {"observation_layers": (-1, 1.5), "time_frequency": (0.0, math.inf)}.items():
         for value in values:
             with raises(ValueError, name, value):

@@ -108,7 +108,7 @@ def test_nothing_can_change_the_decoder(network):
     data = TensorDict({"observation": torch.randn(9, D_O), "action": torch.randn(9, D_A)}, [9])
     actor = make_actor(prior, nfe=1, normalizer=Normalizer.fit(data))
     if network == "transformer":
-        net = ChiTransformer(D_A, D_O, H, TO, embedding_dim=12, num_layers=1, num_heads=2, dropout=0.5)
+        net = ChiTransformer(D_A, D_O, H, TO, hidden_dim=12, num_layers=1, num_heads=2, dropout=0.5)
         actor = WarmPriorActor(net, prior, nfe=1, normalizer=actor.normalizer)
     decoder = PriorDecoder(actor, delta=0.5)
     policy = TensorDictSequential(make_prior_space_actor(D_A, D_O, H, delta=0.5), decoder)

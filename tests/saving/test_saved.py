@@ -67,7 +67,7 @@ def rewrite(folder, change):
     (folder / "config.json").unlink()
 
 
-TRANSFORMER = {"embedding_dim": 12, "num_layers": 2, "num_heads": 2}
+TRANSFORMER = {"hidden_dim": 12, "num_layers": 2, "num_heads": 2}
 
 
 @pytest.mark.parametrize(

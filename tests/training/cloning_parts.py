@@ -21,7 +21,7 @@ def actor_for(prior=None, network=None):
     prior = PastPrior(4) if prior is None else prior
     torch.manual_seed(7)
     if network is None:  # with dropout: the global generator has to be restored too
-        sizes = {"embedding_dim": 8, "num_layers": 1, "num_heads": 2}
+        sizes = {"hidden_dim": 8, "num_layers": 1, "num_heads": 2}
         network = ChiTransformer(2, 3, prior.prediction_length, dropout=0.2, **sizes)
     return WarmPriorActor(network, prior, nfe=2)
 

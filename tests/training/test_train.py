@@ -20,6 +20,7 @@ from warmprior.modules import PreconditionedNetwork
 from warmprior.saving import load_policy
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, make_network, train_policy
+from warmprior.training.networks import check_network
 from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
@@ -117,31 +118,34 @@ def test_the_environment_turns_bars_off(turned_off, tmp_path, monkeypatch, capsy
 
 def test_what_does_not_exist_is_refused_with_what_does():
     refuses(lambda: navigation_task("ph"), ValueError, "style", "'ph'")
-    refuses(lambda: NetworkOptions(network="nonsense"), ValueError, "network", "mlp, plain_mlp", "'nonsense'")
+    with raises(ValueError, "network", "mlp, plain_mlp", "'nonsense'"):
+        train_policy("missing.hdf5", PastPrior(4), network=NetworkOptions("nonsense"))  # before data are read
     with raises(ValueError, "encoder", "resnet18, small", "'resnet18-imagnet'"):
         NetworkOptions(encoder="resnet18-imagnet")  # its weights would be random
 
 
 @pytest.mark.parametrize(("name", "value"), [("observation_layers", 2), ("time_frequency", 1e-4)])
-def test_options_of_transformers_reach_them_alone(name, value):
+def test_options_behind_a_network_s_name_reach_it(name, value):
     for network in ("chi_transformer", "adaln_transformer"):
         usual, made = (
-            make_network(NetworkOptions(network, hidden_dim=12, **more), 2, 3, 4)
-            for more in ({}, {name: value})
+            make_network(NetworkOptions(network + more, hidden_dim=12), 2, 3, 4)
+            for more in ("", f",{name}={value}")
         )
         assert made.config() == usual.config() | {name: value} != usual.config()
     assert (
         make_network(NetworkOptions("chi_transformer"), 2, 3, 4).config() == ChiTransformer(2, 3, 4).config()
     )
-    seeing = NetworkOptions("chi_transformer", hidden_dim=12, encoder="small", crop_size=8, **{name: value})
+    with raises(ValueError, "hidden_dim", "chi_transformer,hidden_dim=12"):
+        make_network(NetworkOptions("chi_transformer,hidden_dim=12", hidden_dim=24), 2, 3, 4)
+    seeing = NetworkOptions(f"chi_transformer,{name}={value}", hidden_dim=12, encoder="small", crop_size=8)
     network = make_network(seeing, 2, 3, 4, {"camera": 10})  # behind an encoder of images
     assert network.config()["network"][name] == value
     images = {"state": torch.zeros(5, 2, 3), "camera": torch.zeros(5, 2, 3, 10, 10, dtype=torch.uint8)}
     assert network(torch.rand(5), torch.randn(5, 4, 2), TensorDict(images, [5])).shape == (5, 4, 2)
     for network in ("mlp", "plain_mlp"):
-        with raises(ValueError, name, "chi_transformer and adaln_transformer", network):
-            NetworkOptions(network, **{name: value})
-    refuses(lambda: NetworkOptions("chi_transformer", **{name: -1}), ValueError, name, -1)
+        with raises(ValueError, name, "hidden_dim"):  # what it takes
+            check_network(NetworkOptions(f"{network},{name}={value}"))
+    refuses(lambda: check_network(NetworkOptions(f"chi_transformer,{name}=-1")), ValueError, name, -1)
 
 
 def test_options_of_images_are_refused_without_images():

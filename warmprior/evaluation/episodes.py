@@ -18,8 +18,7 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm
 
 from warmprior import keys
 from warmprior.checks import check_whole_numbers, is_true
-from warmprior.evaluation.parallel import base_of, transforms_of, watched
-from warmprior.evaluation.row_seeding import row_seeding
+from warmprior.evaluation.parallel import base_of, row_seeding, transforms_of, watched
 from warmprior.io.progress import progress_bar
 from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import check_usual_keys

@@ -1,4 +1,4 @@
-"""Environments in worker processes, and an error if one of them dies."""
+"""Environments in worker processes: which episodes their rows play, and an error if a worker dies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, override
 
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from warmprior.checks import check_whole_numbers
@@ -125,6 +125,24 @@ def base_of(env: EnvBase) -> EnvBase:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def row_seeding(env: EnvBase) -> Callable[[int, int], None]:
+    """Return a function that sets the seed of a row's next episode, to be called before its reset.
+
+    Raises ValueError if the rows of the environment cannot be seeded.
+    """
+    base = base_of(env)
+    if getattr(type(base), "strided_seeds", False):
+        return lambda row, seed: None
+    if not isinstance(base, (SerialEnv, ParallelEnv)):
+        raise ValueError(
+            f"the seeds that the {env.batch_size[0]} rows of {type(base).__name__} play are unknown: put "
+            "single environments into a SerialEnv, a ParallelEnv or parallel_env; or, if set_seed(seed, "
+            "static_seed=True) lets row i play seed + i, seed + i + n, ..., set strided_seeds in its class"
+        )
+    rows = [base[row] for row in range(env.batch_size[0])]
+    return lambda row, seed: rows[row].set_seed(seed, static_seed=True)
 
 
 @contextmanager

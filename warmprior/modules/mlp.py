@@ -52,6 +52,8 @@ class VelocityMLP(VelocityNetwork):
         torch.Size([4, 8, 7])
     """
 
+    name = "mlp"
+
     def __init__(
         self,
         action_dim: int,
@@ -108,6 +110,8 @@ class PlainMLP(VelocityNetwork):
         >>> PlainMLP(1, 1, 4, 1)(torch.rand(8), torch.randn(8, 4, 1), torch.randn(8, 1, 1)).shape
         torch.Size([8, 4, 1])
     """
+
+    name = "plain_mlp"
 
     def __init__(
         self,

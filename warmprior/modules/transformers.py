@@ -11,11 +11,11 @@ from warmprior.checks import check_whole_numbers
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 
 
-def _check_sizes(num_heads: int, embedding_dim: int, num_layers: int, observation_layers: int) -> None:
-    check_whole_numbers(num_heads=num_heads, embedding_dim=embedding_dim, num_layers=num_layers)
+def _check_sizes(num_heads: int, hidden_dim: int, num_layers: int, observation_layers: int) -> None:
+    check_whole_numbers(num_heads=num_heads, hidden_dim=hidden_dim, num_layers=num_layers)
     check_whole_numbers(0, observation_layers=observation_layers)
-    if embedding_dim % num_heads:
-        raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
+    if hidden_dim % num_heads:
+        raise ValueError(f"num_heads must divide hidden_dim, got {num_heads} and {hidden_dim}")
 
 
 class ChiTransformer(VelocityNetwork):
@@ -36,9 +36,9 @@ class ChiTransformer(VelocityNetwork):
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-        embedding_dim: width of the tokens.
+        hidden_dim: width of the tokens.
         num_layers: decoder layers.
-        num_heads: attention heads, a divisor of ``embedding_dim``.
+        num_heads: attention heads, a divisor of ``hidden_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
         dropout: dropout rate of attention and feed-forward layers.
         observation_layers: hidden layers of a network that makes the observation tokens from all ``To`` steps
@@ -46,15 +46,17 @@ class ChiTransformer(VelocityNetwork):
         time_frequency: the highest frequency of the time embedding; the lowest is 1.
 
     Raises:
-        ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
+        ValueError: if a size is not positive, or ``num_heads`` does not divide ``hidden_dim``.
 
     Examples:
         >>> import torch
         >>> from warmprior import ChiTransformer
-        >>> network = ChiTransformer(7, 23, 8, embedding_dim=24, num_layers=2)
+        >>> network = ChiTransformer(7, 23, 8, hidden_dim=24, num_layers=2)
         >>> network(torch.rand(4), torch.randn(4, 8, 7), torch.randn(4, 2, 23)).shape
         torch.Size([4, 8, 7])
     """
+
+    name = "chi_transformer"
 
     def __init__(
         self,
@@ -63,7 +65,7 @@ class ChiTransformer(VelocityNetwork):
         prediction_length: int,
         observation_steps: int = 2,
         *,
-        embedding_dim: int = 384,
+        hidden_dim: int = 384,
         num_layers: int = 8,
         num_heads: int = 6,
         timestep_embedding_dim: int = 128,
@@ -72,41 +74,41 @@ class ChiTransformer(VelocityNetwork):
         time_frequency: float = 100.0,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_sizes(num_heads, embedding_dim, num_layers, observation_layers)
-        self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
+        _check_sizes(num_heads, hidden_dim, num_layers, observation_layers)
+        self.hidden_dim, self.num_layers, self.num_heads = hidden_dim, num_layers, num_heads
         self.timestep_embedding_dim, self.dropout = timestep_embedding_dim, dropout
         self.observation_layers, self.time_frequency = observation_layers, time_frequency
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim, time_frequency),
-            nn.Linear(timestep_embedding_dim, embedding_dim),
+            nn.Linear(timestep_embedding_dim, hidden_dim),
         )
-        self.embed_action = nn.Linear(action_dim, embedding_dim)
-        self.embed_observation: nn.Module = nn.Linear(observation_dim, embedding_dim)
+        self.embed_action = nn.Linear(action_dim, hidden_dim)
+        self.embed_observation: nn.Module = nn.Linear(observation_dim, hidden_dim)
         if observation_layers:
-            sizes = observation_steps * observation_dim, observation_steps * embedding_dim
+            sizes = observation_steps * observation_dim, observation_steps * hidden_dim
             self.embed_observation = nn.Sequential(
                 nn.Flatten(),
-                MLP(*sizes, depth=observation_layers, num_cells=embedding_dim, activation_class=nn.GELU),
-                nn.Unflatten(-1, (observation_steps, embedding_dim)),
+                MLP(*sizes, depth=observation_layers, num_cells=hidden_dim, activation_class=nn.GELU),
+                nn.Unflatten(-1, (observation_steps, hidden_dim)),
             )
-        self.action_position = nn.Parameter(torch.empty(1, prediction_length, embedding_dim))
-        self.memory_position = nn.Parameter(torch.empty(1, 1 + observation_steps, embedding_dim))
+        self.action_position = nn.Parameter(torch.empty(1, prediction_length, hidden_dim))
+        self.memory_position = nn.Parameter(torch.empty(1, 1 + observation_steps, hidden_dim))
         self.encoder = nn.Sequential(
-            nn.Linear(embedding_dim, 4 * embedding_dim),
+            nn.Linear(hidden_dim, 4 * hidden_dim),
             nn.Mish(),
-            nn.Linear(4 * embedding_dim, embedding_dim),
+            nn.Linear(4 * hidden_dim, hidden_dim),
         )
         layer = nn.TransformerDecoderLayer(
-            embedding_dim,
+            hidden_dim,
             num_heads,
-            dim_feedforward=4 * embedding_dim,
+            dim_feedforward=4 * hidden_dim,
             dropout=dropout,
             activation="gelu",
             batch_first=True,
             norm_first=True,
         )
         self.decoder = nn.TransformerDecoder(layer, num_layers)
-        self.head = nn.Sequential(nn.LayerNorm(embedding_dim), nn.Linear(embedding_dim, action_dim))
+        self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, action_dim))
         mask = nn.Transformer.generate_square_subsequent_mask(prediction_length)
         self.causal_mask = nn.Buffer(mask, persistent=False)
         self.apply(self._init_weights)
@@ -171,23 +173,25 @@ class AdaLNTransformer(VelocityNetwork):
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-        embedding_dim: width of the tokens.
+        hidden_dim: width of the tokens.
         num_layers: blocks.
-        num_heads: attention heads, a divisor of ``embedding_dim``.
+        num_heads: attention heads, a divisor of ``hidden_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
         observation_layers: hidden layers of the network that reads all ``To`` steps together.
         time_frequency: the highest frequency of the time embedding; the lowest is 1.
 
     Raises:
-        ValueError: if a size is not positive, or ``num_heads`` does not divide ``embedding_dim``.
+        ValueError: if a size is not positive, or ``num_heads`` does not divide ``hidden_dim``.
 
     Examples:
         >>> import torch
         >>> from warmprior import AdaLNTransformer
-        >>> network = AdaLNTransformer(7, 23, 8, embedding_dim=24, num_layers=2)
+        >>> network = AdaLNTransformer(7, 23, 8, hidden_dim=24, num_layers=2)
         >>> network(torch.rand(4), torch.randn(4, 8, 7), torch.randn(4, 2, 23)).shape
         torch.Size([4, 8, 7])
     """
+
+    name = "adaln_transformer"
 
     def __init__(
         self,
@@ -196,7 +200,7 @@ class AdaLNTransformer(VelocityNetwork):
         prediction_length: int,
         observation_steps: int = 2,
         *,
-        embedding_dim: int = 384,
+        hidden_dim: int = 384,
         num_layers: int = 8,
         num_heads: int = 6,
         timestep_embedding_dim: int = 128,
@@ -204,22 +208,22 @@ class AdaLNTransformer(VelocityNetwork):
         time_frequency: float = 100.0,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
-        _check_sizes(num_heads, embedding_dim, num_layers, observation_layers)
-        self.embedding_dim, self.num_layers, self.num_heads = embedding_dim, num_layers, num_heads
+        _check_sizes(num_heads, hidden_dim, num_layers, observation_layers)
+        self.hidden_dim, self.num_layers, self.num_heads = hidden_dim, num_layers, num_heads
         self.timestep_embedding_dim = timestep_embedding_dim
         self.observation_layers, self.time_frequency = observation_layers, time_frequency
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim, time_frequency),
-            nn.Linear(timestep_embedding_dim, embedding_dim),
+            nn.Linear(timestep_embedding_dim, hidden_dim),
         )
-        sizes = observation_steps * observation_dim, embedding_dim
+        sizes = observation_steps * observation_dim, hidden_dim
         self.embed_observation = MLP(
-            *sizes, depth=observation_layers, num_cells=embedding_dim, activation_class=nn.GELU
+            *sizes, depth=observation_layers, num_cells=hidden_dim, activation_class=nn.GELU
         )
-        self.embed_action = nn.Linear(action_dim, embedding_dim)
-        self.action_position = nn.Parameter(0.02 * torch.randn(1, prediction_length, embedding_dim))
-        self.blocks = nn.ModuleList(_AdaLNBlock(embedding_dim, num_heads) for _ in range(num_layers))
-        self.head = nn.Sequential(nn.LayerNorm(embedding_dim), nn.Linear(embedding_dim, action_dim))
+        self.embed_action = nn.Linear(action_dim, hidden_dim)
+        self.action_position = nn.Parameter(0.02 * torch.randn(1, prediction_length, hidden_dim))
+        self.blocks = nn.ModuleList(_AdaLNBlock(hidden_dim, num_heads) for _ in range(num_layers))
+        self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, action_dim))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Return the velocity ``[B, P, d_a]`` at times ``t`` ``[B]`` and points ``a`` ``[B, P, d_a]``."""

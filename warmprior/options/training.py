@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from warmprior.checks import (
     check_between,
@@ -14,11 +14,6 @@ from warmprior.checks import (
     check_whole_numbers,
     given,
 )
-
-Network = Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"]
-"""The library's networks; ``warmprior/training/networks.py`` has their classes."""
-
-TRANSFORMERS = ("chi_transformer", "adaln_transformer")
 
 Encoder = Literal["resnet18-imagenet", "resnet18", "small"]
 
@@ -35,14 +30,10 @@ class NetworkOptions:
     Attributes:
         network: mlp is small; chi_transformer is the paper's, and plain_mlp that of its toy
             task; adaln_transformer is a faster transformer (adaptive layer norm); or package.module:Class of
-            your own, with options as in package.module:Class,width=64.
-        hidden_dim: width of a network that a name above stands for; the class's own by default.
+            your own. Options of the class follow, as in chi_transformer,num_layers=4.
+        hidden_dim: the network's option of this name, its width; the class's own by default.
         precondition: use the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
-        observation_layers: transformers only; hidden layers of the network that reads all To observations
-            together; by default 1 in adaln_transformer, and 0 in chi_transformer, which embeds each alone.
-        time_frequency: transformers only; the highest frequency of the time embedding, whose lowest is 1; 100
-            by default.
         encoder: image encoder, one network per camera: ResNet-18 with ImageNet's weights, which torchvision
             downloads once, ResNet-18 with random weights, or a small network.
         crop_size: side of the crop of an image in pixels, random in training, central otherwise; by default
@@ -55,12 +46,10 @@ class NetworkOptions:
         2
     """
 
-    network: Network | str = "mlp"
+    network: str = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
-    observation_layers: int | None = None
-    time_frequency: float | None = None
     encoder: Encoder = "resnet18-imagenet"
     crop_size: int | None = None
     share_encoder: bool = False
@@ -68,27 +57,7 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         check_whole_numbers(observation_steps=self.observation_steps)
         check_whole_numbers(**given(hidden_dim=self.hidden_dim, crop_size=self.crop_size))
-        if not self.is_own:
-            check_choice("network", self.network, get_args(Network))
         check_choice("encoder", self.encoder, get_args(Encoder))
-        check_whole_numbers(0, **given(observation_layers=self.observation_layers))
-        check_positive(**given(time_frequency=self.time_frequency))
-        for name in self.of_transformers:
-            if self.network not in TRANSFORMERS:
-                raise ValueError(
-                    f"{name} belongs to {' and '.join(TRANSFORMERS)}: leave it None with the network "
-                    f"{self.network}"
-                )
-
-    @property
-    def is_own(self) -> bool:
-        """Return True if the network is a user's class, in place of a name."""
-        return ":" in self.network.partition(",")[0]
-
-    @property
-    def of_transformers(self) -> dict[str, Any]:
-        """Return the options that transformers alone have, if they are given."""
-        return given(observation_layers=self.observation_layers, time_frequency=self.time_frequency)
 
 
 TimesName = Literal["uniform", "u-shaped", "start"]

@@ -32,7 +32,7 @@ from warmprior.modules.sampling import Sampling
 from warmprior.modules.trend import RestingAction
 from warmprior.saving.training_state import as_key, load_state, save_state
 
-FORMAT = 10
+FORMAT = 11
 """The version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"

@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+
+import torch
 
 from warmprior.checks import given
-from warmprior.modules import (
-    AdaLNTransformer,
-    ChiTransformer,
-    ImageEncoder,
-    PlainMLP,
-    VelocityMLP,
-    VelocityNetwork,
-    VisionNetwork,
-)
+from warmprior.modules import ImageEncoder, VelocityNetwork, VisionNetwork
 from warmprior.modules.encoder import load_imagenet
 from warmprior.options.data import Resize
 from warmprior.options.training import OF_IMAGES, PRETRAINED, NetworkOptions
 from warmprior.training.option_text import find, make
 
-_NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
-    "mlp": (VelocityMLP, "hidden_dim"),
-    "plain_mlp": (PlainMLP, "hidden_dim"),
-    "chi_transformer": (ChiTransformer, "embedding_dim"),
-    "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
-}
-"""The class and the option of width of every ``Network``, a name in ``warmprior/options/training.py``."""
 
+def network_class(options: NetworkOptions) -> type[VelocityNetwork]:
+    """Return the class of the network; a user's own is imported, and saved policies with it can be loaded.
 
-def own_network(options: NetworkOptions) -> type[VelocityNetwork] | None:
-    """Import a user's network, and return its class; return ``None`` for others.
-
-    A saved policy that has one is then loaded. Raises ValueError if there is no such network.
+    Raises ValueError if there is no such class.
     """
-    return find(VelocityNetwork, options.network.partition(",")[0]) if options.is_own else None
+    return find(VelocityNetwork, options.network.partition(",")[0])
+
+
+def check_network(options: NetworkOptions) -> None:
+    """Raise ValueError if there is no such network, or if it does not take its options.
+
+    A user's own is not built, since it may need the sizes of data.
+    """
+    if network_class(options).__module__.startswith("warmprior."):
+        with torch.device("meta"):  # nothing is computed
+            _make(options, 1, 1, 1, options.observation_steps)
+
+
+def _make(options: NetworkOptions, *sizes: int) -> VelocityNetwork:
+    network = make(VelocityNetwork, options.network, *sizes, **given(hidden_dim=options.hidden_dim))
+    network.check_sizes(*sizes)  # a constructor may take them in another order
+    return network
 
 
 def make_network(
@@ -48,7 +49,7 @@ def make_network(
     """Return a network with fresh weights for widths ``d_a`` and ``d_o`` and images' sides in pixels.
 
     With images, ``d_o`` is the width of the vector, and ``resize`` how the images got their size. Raises
-    ValueError for options of images without any, and for a network of the user's that cannot be built.
+    ValueError for options of images without any, and for a network that cannot be built.
 
     Examples:
         >>> import torch
@@ -75,12 +76,5 @@ def make_network(
         if options.encoder == PRETRAINED:
             load_imagenet(encoder)
         observation_dim = encoder.observation_dim
-    sizes = (action_dim, observation_dim, prediction_length, options.observation_steps)
-    if options.is_own:
-        network = make(VelocityNetwork, options.network, *sizes)
-        network.check_sizes(*sizes)  # a constructor may take them in another order
-    else:
-        kind, width = _NETWORKS[options.network]
-        arguments: Any = options.of_transformers | given(**{width: options.hidden_dim})
-        network = kind(*sizes, **arguments)
+    network = _make(options, action_dim, observation_dim, prediction_length, options.observation_steps)
     return network if encoder is None else VisionNetwork(encoder, network)

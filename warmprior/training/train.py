@@ -31,7 +31,7 @@ from warmprior.saving.policies import load_policy
 from warmprior.tasks.task import Task
 from warmprior.training.cloning import BehaviourCloning
 from warmprior.training.learned_parts import learned, learns_first
-from warmprior.training.networks import make_network
+from warmprior.training.networks import check_network, make_network
 from warmprior.training.placement import placed
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_replay_buffer, without_images
@@ -167,6 +167,7 @@ def train_policy(
     if see_history and any(map(learns_first, (prior, start))):  # it would be given another observation
         raise ValueError("a source or start point that learns before the flow needs see_history=False")
     check_device(device)  # before the demonstrations are read
+    check_network(network)
     task = _task_of(demonstrations, {"observations": observations, "images": images})
     if isinstance(task.rest, RestingJoints) and not network.precondition:
         raise ValueError(

@@ -227,7 +227,7 @@ def without_images(network: NetworkOptions) -> NetworkOptions:
     return replace(network, **{name: getattr(NetworkOptions, name) for name in OF_IMAGES})
 
 
-def check_network(network: NetworkOptions, data: DataOptions) -> None:
+def check_encoder(network: NetworkOptions, data: DataOptions) -> None:
     """Raise an error for options of images that do not fit, and for pretrained weights that are missing."""
     from warmprior.modules.encoder import imagenet_weights
 

@@ -16,11 +16,10 @@ import tyro
 from lab.demonstrations.data_options import (
     DataOptions,
     check_counts,
-    check_network,
+    check_encoder,
     check_place,
     is_simulated,
     naming,
-    without_images,
 )
 from warmprior.io.distributed import check_batch, launched
 from warmprior.options.defaults import EVALUATION_SEED
@@ -186,21 +185,15 @@ class Options:
         return [self.training]
 
     def check(self) -> None:
-        import torch
-
-        from warmprior.training import make_network
-        from warmprior.training.networks import own_network
+        from warmprior.training.networks import check_network
 
         self.data.check()
         self.evaluation.check()
-        check_network(self.network, self.data)
+        check_encoder(self.network, self.data)
         with naming("--batch-size", self.training.batch_size):
             check_batch(self.training.batch_size)
         with naming("--network", self.network.network):
-            own = own_network(self.network)
-        if own is None:
-            with naming("--hidden-dim", self.network.hidden_dim), torch.device("meta"):  # nothing is computed
-                make_network(without_images(self.network), 1, 1, 2)
+            check_network(self.network)
         if self.data.actions != "delta" and any(":" in task for task in self.data.task):
             raise ValueError(
                 "--actions absolute is for robosuite's tasks, and a task of your own has its own: add "

@@ -31,7 +31,7 @@ PRESETS: dict[str, Options] = {
 PRESETS["much-ado"] = with_parts(
     PRESETS["paper"],
     data={"actions": "absolute"},
-    network={"observation_layers": 2, "time_frequency": 1e-4},
+    network={"network": "chi_transformer,observation_layers=2,time_frequency=0.0001"},
     training={"warmup_ratio": 0.0, "max_grad_norm": 100.0, "count_padding": True},
     evaluation={"temperature": (0.0,)},
 )

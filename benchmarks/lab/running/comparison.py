@@ -18,8 +18,8 @@ from lab.methods.methods import Method
 from lab.options.options import Evaluation, Options
 from lab.reporting.rows import PLAYED, RESULTS, read_rows, write_rows
 from lab.running.jobs import Job, Jobs
-from lab.running.measuring import measure
-from lab.running.policies import Cell, Policy, facts_of, play, row, train
+from lab.running.measuring import measure, row
+from lab.running.policies import Cell, Policy, facts_of, play, train
 from warmprior.evaluation import Episode
 from warmprior.io.distributed import from_leader, rank, world_size
 from warmprior.io.files import check_writable, write_atomic

@@ -1,4 +1,4 @@
-"""The job that measures a policy on its training data, and the observations that it has not seen."""
+"""What is measured of a policy: on its training data, on data that it has not seen, and as it plays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import hashlib
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,19 @@ from tensordict import TensorDictBase
 from lab.demonstrations.loading import place_of, read_like
 from lab.demonstrations.scripted.generate import generate_demonstrations
 from lab.measures.memory_gain import memory_gain
-from lab.measures.source_errors import mean_error, source_coverage
+from lab.measures.source_errors import mean_error, mean_revision, source_coverage
 from lab.measures.straightness import bounds
 from lab.options.options import MeasuredOptions
-from lab.running.policies import Policy
+from lab.running.policies import Cell, Policy
 from warmprior.diagnostics import (
     SharedObservations,
     curvature,
     encoded_windows,
+    smoothness,
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes
+from warmprior.evaluation import Episode
 from warmprior.keys import EPISODE, OBSERVATION, STATE
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
@@ -78,6 +80,39 @@ def measure(
             **flow,
         }
         for nfe in allowed
+    }
+
+
+def row(
+    policy: Policy, cell: Cell, episodes: Iterable[Episode], measures: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the row of a cell in `results.jsonl`: the policy, how it was played, and the results."""
+    # Sums depend on the order, so episodes are sorted by their seeds.
+    episodes = sorted(episodes, key=lambda episode: episode.seed)
+    decisions = torch.cat([episode.decisions for episode in episodes])
+    # Episodes of a single decision have no boundary between chunks.
+    several = any(len(episode.decisions) > 1 for episode in episodes)
+    smooth = smoothness(decisions) if several else None
+    solved = [episode.success for episode in episodes]
+    values_by_measure = {
+        name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures
+    }
+    return {
+        **policy.facts,
+        **cell.facts(),
+        "first_episode": episodes[0].seed,
+        "episodes": len(solved),
+        "successes": sum(solved),
+        "success_rate": sum(solved) / len(solved),
+        "mean_steps": sum(episode.steps for episode in episodes) / len(solved),
+        "boundary_jump": None if smooth is None else smooth.boundary_jump,
+        "inner_jump": None if smooth is None else smooth.inner_jump,
+        "mean_revision": mean_revision(decisions),
+        # The prefix keeps a task's measures apart from other columns.
+        **{f"episode_{name}": sum(values) / len(values) for name, values in values_by_measure.items()},
+        **measures,
+        "training_seconds": policy.seconds,
+        "outcomes": "".join("01"[solved] for solved in solved),
     }
 
 

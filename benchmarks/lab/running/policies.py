@@ -1,7 +1,7 @@
-"""Policies of a comparison: their folders, the jobs that train and play them, and their rows.
+"""Policies of a comparison: their folders, and the jobs that train and play them.
 
 The name of a policy's folder contains a digest of everything that determines it, so runs with the same
-options share it. A row is one JSON object in `results.jsonl`, with the results of one evaluation.
+options share it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache
@@ -24,12 +24,10 @@ from torchrl.record.loggers import get_logger
 
 from lab.demonstrations.data_options import DataOptions, without_images
 from lab.demonstrations.loading import load_task, longest_of, space_of, task_places, title_of
-from lab.measures.source_errors import mean_revision
 from lab.methods.methods import Method, code_digest
 from lab.options.options import Evaluation, Options, Run, with_parts
 from lab.options.stored_options import of_run, stored_options
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import smoothness
 from warmprior.evaluation import Episode, play_episode
 from warmprior.io.distributed import from_leader, leader_first, rank
 from warmprior.io.files import digest_of, read_json, write_atomic
@@ -39,7 +37,7 @@ from warmprior.saving.training_state import load_state, run_identity
 from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 from warmprior.training.cloning import policy_path
-from warmprior.training.networks import own_network
+from warmprior.training.networks import network_class
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class Policy:
     def load(self, checkpoint: int | None = None) -> WarmPriorActor:
         """Load the policy of averaged weights on the CPU, with this comparison's environment and grid."""
         path = policy_path(self.folder, checkpoint or self.training.iterations)
-        own_network(self.network)  # a worker process has not imported it
+        network_class(self.network)  # a worker process has not imported it
         # Runs with another time limit share the file.
         policy = load_policy(path).replace(environment=self.task().environment)
         return policy.replace(grid=self.grid) if self.method.is_flow else policy
@@ -155,12 +153,11 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
     """Return the policy of another method on a task, with the options of the policy `like`."""
-    network, own = asdict(like.network), own_network(like.network)
     identity = run_identity(
         task.identity,
         asdict(like.training),
         method=method.config(),
-        network=network if own is None else network | {"code": code_digest(own)},
+        network=asdict(like.network) | {"code": code_digest(network_class(like.network))},
         device=like.run.device,
         compile=like.run.compile,
         versions={name: version(name) for name in ("torch", "warmprior")},
@@ -327,36 +324,3 @@ def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor,
 def simulator(place: tuple[Any, ...], play_on: bool) -> EnvBase:
     """Return the environment of a task, kept for all policies, because building it takes a second."""
     return cached_task(*place).make_env(**({"terminate_on_success": False} if play_on else {}))
-
-
-def row(
-    policy: Policy, cell: Cell, episodes: Iterable[Episode], measures: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the row of a cell: the policy, how it was played, and the results."""
-    # Sums depend on the order, so episodes are sorted by their seeds.
-    episodes = sorted(episodes, key=lambda episode: episode.seed)
-    decisions = torch.cat([episode.decisions for episode in episodes])
-    # Episodes of a single decision have no boundary between chunks.
-    several = any(len(episode.decisions) > 1 for episode in episodes)
-    smooth = smoothness(decisions) if several else None
-    solved = [episode.success for episode in episodes]
-    values_by_measure = {
-        name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures
-    }
-    return {
-        **policy.facts,
-        **cell.facts(),
-        "first_episode": episodes[0].seed,
-        "episodes": len(solved),
-        "successes": sum(solved),
-        "success_rate": sum(solved) / len(solved),
-        "mean_steps": sum(episode.steps for episode in episodes) / len(solved),
-        "boundary_jump": None if smooth is None else smooth.boundary_jump,
-        "inner_jump": None if smooth is None else smooth.inner_jump,
-        "mean_revision": mean_revision(decisions),
-        # The prefix keeps a task's measures apart from other columns.
-        **{f"episode_{name}": sum(values) / len(values) for name, values in values_by_measure.items()},
-        **measures,
-        "training_seconds": policy.seconds,
-        "outcomes": "".join("01"[solved] for solved in solved),
-    }

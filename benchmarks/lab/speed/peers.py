@@ -47,14 +47,14 @@ class Peer:
         return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
 
 
-def ours(kind: type[VelocityNetwork], option: str, width: int, device: str) -> Peer:
-    """Return FlowMatchingLoss on one of this library's networks; ``option`` names its width."""
-    network = kind(D_A, D_O, H, TO, **{option: width}).to(device)
+def ours(kind: Callable[..., VelocityNetwork], width: int, device: str) -> Peer:
+    """Return FlowMatchingLoss on one of this library's networks."""
+    network = kind(D_A, D_O, H, TO, hidden_dim=width).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
     data = one_decision(device)
     return Peer(
-        f"warmprior: FlowMatchingLoss, {kind.__name__}",
+        f"warmprior: FlowMatchingLoss, {type(network).__name__}",
         network,
         lambda batch: loss(batch)["loss_flow_matching"],
         lambda nfe: actor(data, nfe=nfe),
@@ -180,9 +180,9 @@ def lerobot_multi_task_dit(width: int, device: str) -> Peer:
     return lerobot("lerobot: multi_task_dit", policy, to_batch, set_steps, device)
 
 
-warmprior_transformer = partial(ours, ChiTransformer, "embedding_dim")  # the paper's network
-warmprior_adaln = partial(ours, AdaLNTransformer, "embedding_dim")
-warmprior_mlp = partial(ours, VelocityMLP, "hidden_dim")
+warmprior_transformer = partial(ours, ChiTransformer)  # the paper's network
+warmprior_adaln = partial(ours, AdaLNTransformer)
+warmprior_mlp = partial(ours, VelocityMLP)
 
 
 def training_step(peer: Peer, sample: Callable[[], Batch]) -> Callable[[], object]:

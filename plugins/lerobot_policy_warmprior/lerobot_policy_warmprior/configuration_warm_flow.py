@@ -62,7 +62,7 @@ class WarmFlowConfig(PreTrainedConfig):
             actions, and the numbers are near. Training replaces ``auto`` by what it found.
         ema_rate: decay of the averaged weights, which are used at decisions.
         network: configuration of another velocity network, as JSON (``VelocityNetwork.config()``).
-        embedding_dim: width of the transformer.
+        hidden_dim: width of the transformer.
         num_layers: number of layers of the transformer.
         num_heads: number of attention heads of the transformer.
         dropout: dropout of the transformer.
@@ -86,7 +86,7 @@ class WarmFlowConfig(PreTrainedConfig):
     joints: str = "auto"
     ema_rate: float = 0.995
     network: str = ""
-    embedding_dim: int = 384
+    hidden_dim: int = 384
     num_layers: int = 8
     num_heads: int = 6
     dropout: float = 0.1
@@ -132,7 +132,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def meaning(self, *, training: bool) -> dict[str, Any]:
         """Return the options that saved weights depend on; a training run may change the source."""
-        names = ["n_obs_steps", "precondition", "joints", "network", "embedding_dim", "num_layers"]
+        names = ["n_obs_steps", "precondition", "joints", "network", "hidden_dim", "num_layers"]
         names += ["num_heads", "image_size", "resize", "crop_size", "normalization_mapping"]
         return {
             **{name: getattr(self, name) for name in names},

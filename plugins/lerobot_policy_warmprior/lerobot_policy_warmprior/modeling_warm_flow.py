@@ -136,7 +136,7 @@ class WarmFlowPolicy(WholePolicy, PreTrainedPolicy):
         else:
             network = ChiTransformer(
                 *sizes,
-                embedding_dim=config.embedding_dim,
+                hidden_dim=config.hidden_dim,
                 num_layers=config.num_layers,
                 num_heads=config.num_heads,
                 dropout=config.dropout,
