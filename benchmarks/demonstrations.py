@@ -1,6 +1,7 @@
-"""Generate, download or render the demonstrations of the benchmarks' tasks.
+"""Generate, play, download or render the demonstrations of the benchmarks' tasks.
 
 python benchmarks/demonstrations.py generate lift --n 100 --out lift.hdf5     # by a scripted expert
+python benchmarks/demonstrations.py play policies/lift --out own.hdf5         # by a saved policy
 python benchmarks/demonstrations.py download square mh                        # the official ones
 python benchmarks/demonstrations.py render square.hdf5 --cameras agentview    # images from their states
 """
@@ -31,6 +32,14 @@ def main(argv: list[str] | None) -> None:
     add("--out", type=Path, help="HDF5 file to write (default: in the cache)")
     add("--overwrite", action="store_true", help="replace an existing file")
 
+    add = commands.add_parser("play", help="let a saved policy play, and keep what it solves").add_argument
+    add("folder", type=Path, help="folder of the policy, made for an environment of robosuite")
+    add("--n", type=int, default=200, help="number of demonstrations (default: %(default)s)")
+    add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
+    add("--seed", type=int, default=1, help="0 to 99, for episodes of their own (default: %(default)s)")
+    add("--out", type=Path, required=True, help="HDF5 file to write")
+    add("--overwrite", action="store_true", help="replace an existing file")
+
     add = commands.add_parser("download", help="download the official file of a task").add_argument
     add("task", choices=list(OFFICIAL))
     add("style", nargs="?", help="style, such as ph or mh (default: the first that is published)")
@@ -49,11 +58,15 @@ def main(argv: list[str] | None) -> None:
     argv = (sys.argv[1:] if argv is None else argv) or ["--help"]
     args = read_command_line(lambda: parser.parse_args(argv))
     from lab.demonstrations.downloads import download_robomimic
+    from lab.demonstrations.played import play_demonstrations
     from lab.demonstrations.render import render_demonstrations
     from lab.demonstrations.scripted.generate import generate_demonstrations
 
     if args.command == "generate":
         print(generate_demonstrations(args.task, args.style, args.n, path=args.out, overwrite=args.overwrite))
+    elif args.command == "play":
+        options = {"path": args.out, "nfe": args.nfe, "overwrite": args.overwrite}
+        print(play_demonstrations(args.folder, args.n, args.seed, **options))
     elif args.command == "download":
         print(download_robomimic(args.task, args.style, force=args.force))
     else:

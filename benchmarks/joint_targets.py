@@ -26,7 +26,7 @@ from lab.options.presets import PRESETS
 if TYPE_CHECKING:
     import numpy as np
 
-    from lab.demonstrations.scripted.episode import Episode
+    from lab.demonstrations.episodes import Episode
     from warmprior.envs.control_loop import StepLoop
     from warmprior.tasks import Task
 
@@ -75,36 +75,23 @@ def followed(path: Path, loop: StepLoop) -> Iterator[Episode]:
 
 def follow(loop: StepLoop, state: np.ndarray, actions: np.ndarray) -> Episode:
     """Play targets from a state until the task is solved for six steps."""
-    import numpy as np
-
-    from lab.demonstrations.scripted.episode import Episode
+    from lab.demonstrations.episodes import Recorder
 
     loop.reset(0)
-    observations, states, rewards = [loop.set_state(state)], [], []
+    recorder = Recorder(loop)
+    recorder.begin(loop.set_state(state))
     for robot in loop.env.robots:
         robot.composite_controller.reset()
     for action in actions:
-        states.append(loop.state())
-        observation, success = loop.step(action)
-        observations.append(observation)
-        rewards.append(float(success))
-        if sum(rewards[-6:]) == 6:
+        recorder.step(action)
+        if sum(recorder.rewards[-6:]) == 6:
             break
-    return Episode(
-        seed=0,
-        operator=0,
-        level="better",
-        success=any(rewards),
-        actions=actions[: len(rewards)],
-        states=np.stack(states),
-        rewards=np.array(rewards),
-        observations={key: np.stack([step[key] for step in observations]) for key in observations[0]},
-    )
+    return recorder.episode(seed=0, success=any(recorder.rewards))
 
 
 def demonstrations(style: str, count: int) -> Path:
     """Return the file of the follower's demonstrations; record it if it does not exist."""
-    from lab.demonstrations.scripted.episode import write_robomimic
+    from lab.demonstrations.episodes import write_robomimic
     from lab.demonstrations.scripted.generate import generate_demonstrations
     from warmprior.envs.control_loop import StepLoop
     from warmprior.envs.simulator import make_simulator

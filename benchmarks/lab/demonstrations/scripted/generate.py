@@ -2,39 +2,65 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
-from torchrl._utils import logger
+import numpy as np
 from tqdm import tqdm
 
-from lab.demonstrations.scripted.episode import (
+from lab.demonstrations.episodes import (
+    SEEDS_PER_FILE,
     Episode,
-    expert_loop,
+    Recorder,
     operator_of,
-    run_episode,
+    successes,
     write_robomimic,
 )
 from lab.demonstrations.scripted.experts import EXPERTS
-from lab.demonstrations.scripted.operators import OPERATORS
+from lab.demonstrations.scripted.motion import ArmRunner
+from lab.demonstrations.scripted.operators import OPERATORS, SKILLED, Demonstrator
 from lab.io.workers import available_cores, working
 from warmprior.checks import check_between, check_choice, check_whole_numbers, given
-from warmprior.envs.control_loop import ControlLoop
+from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.robosuite_tasks import get_task
-from warmprior.envs.simulator import import_robosuite, task_env_args
+from warmprior.envs.simulator import import_robosuite, make_simulator, task_env_args
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
 from warmprior.options.defaults import EVALUATION_SEED
 
 #: Part of every cached file's name; raised when the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
-#: The file of a ``seed`` uses at most this many simulator seeds, from ``seed * SEEDS_PER_FILE`` on.
-SEEDS_PER_FILE = 100_000
 _STYLES = ("ph", "mh")
+_EXTRA_KEYS = ("eef_quat_site", "gripper_qvel", "joint_pos", "joint_vel")
+_HOLD = 6  # steps that the task must stay solved for before the episode ends
+
+
+def expert_loop(task: str) -> ControlLoop:
+    """Make the simulation that a task's expert acts in."""
+    spec = get_task(task)
+    extra = (f"robot{i}_{key}" for i in range(spec.arms) for key in _EXTRA_KEYS)
+    return ControlLoop(make_simulator(task_env_args(task)), (*spec.low_dim_keys, *extra))
+
+
+def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
+    """Play one scripted episode in an :func:`expert_loop`; the same seed gives the same one.
+
+    It ends six steps after the task is solved, when the plan is exhausted, or at the task's time limit.
+    """
+    index = operator_of(style, seed)
+    operator = OPERATORS[index] if style == "mh" else SKILLED
+    # The first number separates this stream from others with the same seed.
+    person = Demonstrator(operator, np.random.default_rng([7919, seed]))
+    recorder = Recorder(loop)
+    recorder.reset(seed)
+    runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(EXPERTS[task](loop, person))]
+    solved = 0
+    for _ in range(get_task(task).horizon(style)):
+        _, success = recorder.step(np.concatenate([runner.act() for runner in runners]))
+        solved = solved + 1 if success else 0
+        if solved >= _HOLD or (not success and all(runner.given_up for runner in runners)):
+            break
+    return recorder.episode(seed, success=solved > 0, operator=index, level=person.level)
 
 
 def generate_demonstrations(
@@ -106,48 +132,15 @@ def generate_demonstrations(
         model_file = call(_model).result()
         write_robomimic(
             path,
-            _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
+            successes(
+                call, partial(_play, style=style), 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update
+            ),
             env_args=task_env_args(task),
             model_file=model_file,
             seed=seed,
             attributes={"source": "scripted", "generator_version": GENERATOR_VERSION},
         )
     return path
-
-
-def _successes(
-    call: Callable[[Callable[[str], Episode]], Future[Episode]],
-    ahead: int,
-    style: str,
-    n: int,
-    first: int,
-    report: Callable[[int], Any],
-) -> Iterator[Episode]:
-    """Yield the first ``n`` successes in seed order, the same number from each operator."""
-    operators = len(OPERATORS) if style == "mh" else 1
-    remaining = [n // operators + (i < n % operators) for i in range(operators)]
-    limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
-    upcoming = iter(range(first, first + limit))
-    running: deque[Future[Episode]] = deque()
-    played = 0
-    while any(remaining):
-        while len(running) < ahead:
-            # Seeds of operators who have contributed enough are skipped, which does not change the result.
-            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
-            if following is None:
-                break
-            running.append(call(partial(_play, style=style, seed=following)))
-        if not running:
-            raise RuntimeError(
-                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
-            )
-        episode = running.popleft().result()
-        played += 1
-        if episode.success and remaining[episode.operator]:
-            remaining[episode.operator] -= 1
-            report(1)
-            yield episode
-    logger.info(f"{n} demonstrations from {played} scripted episodes")
 
 
 @cache

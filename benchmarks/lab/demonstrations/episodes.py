@@ -1,27 +1,27 @@
-"""Scripted demonstrations, determined by task, style and seed, and their files."""
+"""Recorded episodes, those that are kept as demonstrations, and the files that robomimic opens."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torchrl._utils import logger
 
-from lab.demonstrations.scripted.experts import EXPERTS
-from lab.demonstrations.scripted.motion import ArmRunner
-from lab.demonstrations.scripted.operators import LEVELS, OPERATORS, SKILLED, Demonstrator
-from warmprior.envs.control_loop import ControlLoop, StepLoop
-from warmprior.envs.robosuite_tasks import get_task
-from warmprior.envs.simulator import make_simulator, task_env_args
+from lab.demonstrations.scripted.operators import LEVELS, OPERATORS
+from warmprior.envs.control_loop import Observations, StepLoop
 from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 
-_EXTRA_KEYS = ("eef_quat_site", "gripper_qvel", "joint_pos", "joint_vel")
-_HOLD = 6  # steps that the task must stay solved for before the episode ends
+#: The file of a ``seed`` uses at most this many simulator seeds, from ``seed * SEEDS_PER_FILE`` on.
+SEEDS_PER_FILE = 100_000
 
 
 @dataclass
@@ -43,56 +43,56 @@ class Episode:
     observations: dict[str, np.ndarray]
 
 
-def expert_loop(task: str) -> ControlLoop:
-    """Make the simulation that a task's expert acts in."""
-    spec = get_task(task)
-    extra = (f"robot{i}_{key}" for i in range(spec.arms) for key in _EXTRA_KEYS)
-    return ControlLoop(make_simulator(task_env_args(task)), (*spec.low_dim_keys, *extra))
+class Recorder:
+    """A control loop that records the episode that is played in it.
 
-
-def operator_of(style: str, seed: int) -> int:
-    """Return the index of the operator who plays a seed; in ``mh`` data operators take turns."""
-    return seed % len(OPERATORS) if style == "mh" else 0
-
-
-def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
-    """Play one scripted episode in an :func:`expert_loop`; the same seed gives the same one.
-
-    It ends six steps after the task is solved, when the plan is exhausted, or at the task's time limit.
+    What else the loop has, it has as well.
     """
-    spec = get_task(task)
 
-    def observe(low_dim: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {key: value.astype(np.float64) for key, value in low_dim.items()}
+    def __init__(self, loop: StepLoop) -> None:
+        self.loop = loop
 
-    index = operator_of(style, seed)
-    operator = OPERATORS[index] if style == "mh" else SKILLED
-    # The first number separates this stream from others with the same seed.
-    person = Demonstrator(operator, np.random.default_rng([7919, seed]))
-    observations = [observe(loop.reset(seed))]
-    runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(EXPERTS[task](loop, person))]
-    states, actions, rewards = [], [], []
-    solved = 0
-    for _ in range(spec.horizon(style)):
-        states.append(loop.state())
-        action = np.concatenate([runner.act() for runner in runners])
-        low_dim, success = loop.step(action)
-        actions.append(action)
-        rewards.append(float(success))
-        observations.append(observe(low_dim))
-        solved = solved + 1 if success else 0
-        if solved >= _HOLD or (not success and all(runner.given_up for runner in runners)):
-            break
-    return Episode(
-        seed=seed,
-        operator=index,
-        level=person.level,
-        success=solved > 0,
-        actions=np.stack(actions),
-        states=np.stack(states),
-        rewards=np.array(rewards),
-        observations={key: np.stack([entry[key] for entry in observations]) for key in observations[0]},
-    )
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.loop, name)
+
+    def begin(self, observations: Observations) -> Observations:
+        """Begin an episode at the loop's state, which has these observations, and return them."""
+        self._observations = [_exact(observations)]
+        self._states: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
+        self.rewards: list[float] = []
+        return observations
+
+    def reset(self, seed: int) -> Observations:
+        """Begin the episode of a seed."""
+        return self.begin(self.loop.reset(seed))
+
+    def step(self, action: np.ndarray) -> tuple[Observations, bool]:
+        """Step the loop."""
+        self._states.append(self.loop.state())
+        observations, success = self.loop.step(action)
+        self._actions.append(np.array(action, np.float64))
+        self._observations.append(_exact(observations))
+        self.rewards.append(float(success))
+        return observations, success
+
+    def episode(self, seed: int, *, success: bool, operator: int = 0, level: str = "better") -> Episode:
+        """Return the episode so far."""
+        rows = self._observations
+        return Episode(
+            seed=seed,
+            operator=operator,
+            level=level,
+            success=success,
+            actions=np.stack(self._actions),
+            states=np.stack(self._states),
+            rewards=np.array(self.rewards),
+            observations={key: np.stack([row[key] for row in rows]) for key in rows[0]},
+        )
+
+
+def _exact(observations: Observations) -> dict[str, np.ndarray]:
+    return {key: value.astype(np.float64) for key, value in observations.items()}
 
 
 _VALID_FRACTION = 0.1
@@ -176,3 +176,48 @@ def _filter_keys(levels: list[str], rng: np.random.Generator) -> dict[str, set[i
         keys[name] = demos
         keys |= {f"{name}_{split}": demos & members for split, members in splits.items()}
     return {name: demos for name, demos in keys.items() if demos}
+
+
+def operator_of(style: str, seed: int) -> int:
+    """Return the index of the operator who plays a seed; in ``mh`` data operators take turns."""
+    return seed % len(OPERATORS) if style == "mh" else 0
+
+
+def successes(
+    call: Callable[[Callable[[str], Episode]], Future[Episode]],
+    play: Callable[..., Episode],
+    ahead: int,
+    style: str,
+    n: int,
+    first: int,
+    report: Callable[[int], Any],
+) -> Iterator[Episode]:
+    """Yield the first ``n`` solved episodes in the order of their seeds, the same number from each operator.
+
+    ``call`` submits ``play(state, seed=seed)`` to a process (:func:`~lab.io.workers.working`), ``ahead`` at a
+    time.
+    """
+    operators = len(OPERATORS) if style == "mh" else 1
+    remaining = [n // operators + (i < n % operators) for i in range(operators)]
+    limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
+    upcoming = iter(range(first, first + limit))
+    running: deque[Future[Episode]] = deque()
+    played = 0
+    while any(remaining):
+        while len(running) < ahead:
+            # Seeds of operators who have contributed enough are skipped, which does not change the result.
+            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
+            if following is None:
+                break
+            running.append(call(partial(play, seed=following)))
+        if not running:
+            raise RuntimeError(
+                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
+            )
+        episode = running.popleft().result()
+        played += 1
+        if episode.success and remaining[episode.operator]:
+            remaining[episode.operator] -= 1
+            report(1)
+            yield episode
+    logger.info(f"{n} demonstrations from {played} episodes")
