@@ -34,9 +34,15 @@ def main(argv: list[str] | None) -> None:
 
     add = commands.add_parser("play", help="let a saved policy play, and keep what it solves").add_argument
     add("folder", type=Path, help="folder of the policy, made for an environment of robosuite")
-    add("--n", type=int, default=200, help="number of demonstrations (default: %(default)s)")
+    add("--episodes", type=int, default=200, help="number of episodes to play (default: %(default)s)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
-    add("--seed", type=int, default=1, help="0 to 99, for episodes of their own (default: %(default)s)")
+    add(
+        "--seed",
+        type=int,
+        default=1,
+        help="starts, 0 (scripted demonstrations') to 99 (default: %(default)s)",
+    )
+    add("--import", action="append", default=[], dest="modules", help="module of the policy's own classes")
     add("--out", type=Path, required=True, help="HDF5 file to write")
     add("--overwrite", action="store_true", help="replace an existing file")
 
@@ -65,8 +71,8 @@ def main(argv: list[str] | None) -> None:
     if args.command == "generate":
         print(generate_demonstrations(args.task, args.style, args.n, path=args.out, overwrite=args.overwrite))
     elif args.command == "play":
-        options = {"path": args.out, "nfe": args.nfe, "overwrite": args.overwrite}
-        print(play_demonstrations(args.folder, args.n, args.seed, **options))
+        options = {name: getattr(args, name) for name in ("nfe", "overwrite", "modules")}
+        print(play_demonstrations(args.folder, args.episodes, args.seed, path=args.out, **options))
     elif args.command == "download":
         print(download_robomimic(args.task, args.style, force=args.force))
     else:

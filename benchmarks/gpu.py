@@ -49,7 +49,7 @@ DEMONSTRATIONS = {"state": 100, "image": 6}
 
 SMALLEST: dict[str, dict[str, Any]] = {
     "data": {"demonstrations": (3,), "image_size": 32, "fast_rendering": True},
-    "network": {"hidden_dim": 48, "crop_size": 28},
+    "network": {"network": "chi_transformer,hidden_dim=48", "crop_size": 28},
     "training": {"batch_size": 4},
     "evaluation": {"episodes": 1},
 }

@@ -54,7 +54,7 @@ PLAYED = Evaluation(episodes=256, nfe=(9, 1))
 NAVIGATION_PRESETS = {
     # All policies in a few minutes on two cores.
     "quick": NavigationOptions(
-        network=NetworkOptions(hidden_dim=128, observation_steps=1),
+        network=NetworkOptions("mlp,hidden_dim=128", observation_steps=1),
         training=TrainingConfig(
             iterations=3_000,
             batch_size=256,
@@ -72,7 +72,7 @@ NAVIGATION_PRESETS = {
     # size; the rest of the recipe is that of its robot tasks.
     "paper": NavigationOptions(
         position_only=True,
-        network=NetworkOptions("plain_mlp", hidden_dim=1024, precondition=False, observation_steps=1),
+        network=NetworkOptions("plain_mlp,hidden_dim=1024", precondition=False, observation_steps=1),
         training=replace(PAPER, iterations=50_000, batch_size=256, checkpoints=1),
         sources=SOURCES,
         evaluation=replace(PLAYED, seeds=5),
@@ -146,8 +146,8 @@ def main(argv: list[str] | None) -> None:
                 batch = window[index : index + 1].expand(48).contiguous()
                 generator = torch.Generator().manual_seed(seed)
                 paths[row.method] = flow_paths(actor, batch, generator=generator)[..., 0, 0]
-        network, iterations = options.network.hidden_dim, options.training.iterations
-        what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
+        network, iterations = options.network.network, options.training.iterations
+        what = f"H = {chunk}, {network}, {iterations} iterations, seed {seed}"
         title = f"One-dimensional navigation: {what}"
         plot_navigation(panels, out / "navigation1d.png", chunk_length=chunk, title=title)
         title = f"Paths of the flow above the first obstacle, after a demonstrated history: {what}"

@@ -216,7 +216,7 @@ def trained(camera: bool, rate: float, iterations: int) -> WarmPriorActor:
         demonstrations(camera, rate),
         PastPrior(8, correlation=0.5),
         nfe=3,
-        network=NetworkOptions(hidden_dim=128, **seeing),
+        network=NetworkOptions("mlp,hidden_dim=128", **seeing),
         training=TrainingConfig(iterations=iterations),
         description=None,
     )

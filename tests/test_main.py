@@ -39,7 +39,7 @@ def saved(short_episodes, tmp_path_factory):
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
     task, prior = Task(open_demonstrations(path)), PastPrior(8)
-    network = NetworkOptions(hidden_dim=16)
+    network = NetworkOptions("mlp,hidden_dim=16")
     actor = train_policy(task, prior, folder / "policy", network=network, training=training, description=None)
     env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
     episode = play_episode(actor, env, 10_000_000, nfe=1)
@@ -164,7 +164,7 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
 def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys, monkeypatch):
     path, out = tmp_path / "lift.hdf5", tmp_path / "my runs"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
-    argv = ["train", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
+    argv = ["train", str(path), "--out", str(out), "--network", "mlp,hidden_dim=8", "--seed", "3"]
     small = [*argv, "--iterations", "2", "--prior", "past,correlation=0.5,sigma=0.3"]
     assert main(small) == 0
     *_, said, folder = capsys.readouterr().out.splitlines()
@@ -179,7 +179,10 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys, monkeypat
     assert main([*small, "--compile"]) == 0 and compiled  # there is nothing to do
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
     for words, facts in (
-        ("--iterations 4 --hidden-dim 9", ("iterations was 2 and is 4", "hidden_dim was 8 and is 9")),
+        (
+            "--iterations 4 --network mlp,hidden_dim=9",
+            ("iterations was 2 and is 4", "hidden_dim was 8 and is 9"),
+        ),
         ("--network plain_mlp --no-precondition", ("network was PreconditionedNetwork and is",)),
         ("--demonstrations 1", ("demonstrations",)),
     ):
@@ -226,7 +229,7 @@ def test_a_network_of_ones_own_is_trained_and_imported_again(tmp_path, capsys, m
         assert "Straight" in capsys.readouterr().out
         for words, fact in (
             (["straight_networks:Crooked"], "Crooked"),
-            (["straight_networks:Straight", "--hidden-dim", "8"], "hidden_dim"),
+            (["straight_networks:Straight,hidden_dim=8"], "hidden_dim"),
         ):
             assert not missing(refused([*argv, *words], capsys), fact)
     finally:
@@ -237,7 +240,7 @@ def test_a_network_of_ones_own_is_trained_and_imported_again(tmp_path, capsys, m
 def test_train_at_the_start_alone_is_for_one_step(tmp_path, capsys):
     path = tmp_path / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
-    words = "--times start --iterations 2 --hidden-dim 8 --held-out 1"
+    words = "--times start --iterations 2 --network mlp,hidden_dim=8 --held-out 1"
     assert main(["train", str(path), "--out", str(tmp_path / "out"), *words.split()]) == 0
     said = capsys.readouterr().out
     assert "NFE 1:" in said and "NFE 3:" not in said and "--nfe 1\n" in said
@@ -250,7 +253,9 @@ def test_train_needs_no_simulator(tmp_path, capsys, monkeypatch, task, env_name)
     monkeypatch.setitem(sys.modules, "mimicgen", None)
     path = tmp_path / "own.hdf5"
     write_robomimic_file(path, task=task, env_args=env_args_15(task) | {"env_name": env_name})
-    words = f"train {path} --out {tmp_path} --iterations 2 --hidden-dim 8 --prior cvae,hidden_dim=8"
+    words = (
+        f"train {path} --out {tmp_path} --iterations 2 --network mlp,hidden_dim=8 --prior cvae,hidden_dim=8"
+    )
     assert main(words.split()) == 0
     said = capsys.readouterr().out
     assert "only trained" in said and load_policy(said.splitlines()[-1]).environment is not None
@@ -282,7 +287,7 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     features = {name: numbers(width) for name, width in {"arm": 3, "cup": 2, "action": 4}.items()}
     write_lerobot(tmp_path / "cups", (12, 12), features)
     words = f"train lerobot:{tmp_path / 'cups'} --observations arm cup --iterations 2"
-    assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
+    assert main([*words.split(), "--network", "mlp,hidden_dim=8", "--out", str(tmp_path / "out")]) == 0
     actor = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
     # Its actions are not near the arm; and of what it has, observations alone are named.

@@ -40,7 +40,7 @@ from warmprior.training import BehaviourCloning, NetworkOptions, TrainingConfig,
 
 PRIOR = PastPrior(4)
 CONFIG = TrainingConfig(iterations=1, batch_size=4, checkpoints=1)
-NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
+NETWORK = NetworkOptions("mlp,hidden_dim=8", observation_steps=1)
 SHORT = {"network": NETWORK, "training": CONFIG, "description": None}
 actor = partial(mlp_actor, PRIOR, 1, 3, 1)
 

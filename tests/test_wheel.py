@@ -120,7 +120,7 @@ def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(pytho
 def test_a_simulated_policy_trains_and_plays_with_the_wheel_alone(python, tmp_path):
     pytest.importorskip("robosuite")
     write_robomimic_file(tmp_path / "lift.hdf5", lengths=(30, 40), task="lift")
-    words = "train lift.hdf5 --iterations 3 --batch-size 8 --checkpoints 1 --hidden-dim 16"
+    words = "train lift.hdf5 --iterations 3 --batch-size 8 --checkpoints 1 --network mlp,hidden_dim=16"
     trained = run(python, "-m", "warmprior", *words.split(), cwd=tmp_path).splitlines()[-1]
     one = ["--episodes", "1", "--nfe", "1"]
     printed = run(python, "-m", "warmprior", "evaluate", trained, *one, cwd=tmp_path)

@@ -117,7 +117,7 @@ plt.show()
 # smaller.
 
 folder = tempfile.TemporaryDirectory()
-network = NetworkOptions(hidden_dim=64, observation_steps=1)
+network = NetworkOptions("mlp,hidden_dim=64", observation_steps=1)
 recipe = TrainingConfig(
     iterations=1000,
     batch_size=256,

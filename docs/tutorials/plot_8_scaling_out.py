@@ -31,7 +31,7 @@ torch.manual_seed(0)
 
 folder = tempfile.TemporaryDirectory()
 script = Path("../../benchmarks/navigation1d.py")
-small = "--prior gaussian past --sigma 0.1 --hidden-dim 64 --iterations 300 --nfe 3 --logger none"
+small = "--prior gaussian past --sigma 0.1 --network mlp,hidden_dim=64 --iterations 300 --nfe 3 --logger none"
 
 
 def compare(run, seeds, workers):

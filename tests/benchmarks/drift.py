@@ -126,5 +126,12 @@ def arguments(out, **more):
         "log_every": 5,
         "save_every": 10,
     }
-    values |= {"hidden_dim": 16, "episodes": 7, "seeds": 2, "nfe": [3, 1], "workers": 1, "logger": "none"}
+    values |= {
+        "network": "mlp,hidden_dim=16",
+        "episodes": 7,
+        "seeds": 2,
+        "nfe": [3, 1],
+        "workers": 1,
+        "logger": "none",
+    }
     return command_line(**values | more)

@@ -16,7 +16,7 @@ def command_line(**options):
 def options(path, out, **extra):
     """Command line of a run that takes seconds."""
     values = {"dataset": path, "task": "lift", "out": out, "iterations": 30, "episodes": 1, "workers": 1}
-    values |= {"nfe": 1, "logger": "none", "hidden_dim": 16, "save_every": 10}
+    values |= {"nfe": 1, "logger": "none", "network": "mlp,hidden_dim=16", "save_every": 10}
     return command_line(**values | extra)
 
 

@@ -49,11 +49,13 @@ def test_a_command_line_changes_what_it_says_alone(tmp_path):
     for name, preset in PRESETS.items():
         found = read("--preset", name, out=tmp_path)
         assert found.preset == name and replace(found, run=preset.run, preset=preset.preset) == preset
-    words = "--task can stack --style ph mh --demonstrations 7 9 --hidden-dim 32 --learning-rate 0.5"
+    words = (
+        "--task can stack --style ph mh --demonstrations 7 9 --network mlp,hidden_dim=32 --learning-rate 0.5"
+    )
     words += " --prior past --chunk 2 4 --sigma 0.1 0.2 --seeds 4 --seed 3 --nfe 1 5 --no-precondition"
     found = read(*words.split())
     assert found.data.task == ("can", "stack") and found.data.count("mh") == 9
-    assert (found.network.hidden_dim, found.network.precondition) == (32, False)
+    assert (found.network.network, found.network.precondition) == ("mlp,hidden_dim=32", False)
     assert (found.training.learning_rate, found.evaluation.nfe) == (0.5, (1, 5))
     sources = [(p.name, p.chunk_length, p.sigma) for p in found.sources.methods()]
     assert sources == [("past", h, s) for h in (2, 4) for s in (0.1, 0.2)]

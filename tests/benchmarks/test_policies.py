@@ -135,7 +135,7 @@ def test_equal_policies_are_shared_and_others_are_not(tmp_path, capsys):
 
     # What changes no weights makes no other policy.
     assert exists() and exists(episodes=3, nfe=1, grid="dense-jump", encoder="resnet18")
-    others = {"sigma": 0.4, "batch_size": 8, "hidden_dim": 8, "prior": "past,correlation=0.5"}
+    others = {"sigma": 0.4, "batch_size": 8, "network": "mlp,hidden_dim=8", "prior": "past,correlation=0.5"}
     others["task"] = f"{drift.__name__}:other"
     assert not any(exists(**{name: value}) for name, value in others.items())
 
@@ -203,7 +203,6 @@ def test_a_network_of_ones_own_is_found_in_a_fresh_process_and_trained_again_if_
     file.write_text(NETWORK)
     monkeypatch.syspath_prepend(tmp_path)
     few = {"iterations": 1, "checkpoints": 1, "episodes": 1, "seeds": 1, "nfe": 1, "prior": "past"}
-    few["hidden_dim"] = None  # this network has no such option
     argv = arguments(tmp_path / "out", network=name, **few)
     try:
         assert robomimic.main(argv) == 0

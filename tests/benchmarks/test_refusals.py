@@ -44,11 +44,7 @@ def no_work(monkeypatch):
         ("robomimic", "--prior ot --batch-size 1", ("ot", "batch")),
         ("robomimic", f"--task {DRIFT}:task {DRIFT}:other", ("drift",)),
         ("robomimic", "--no-precondition --weighting standardised", ("--weighting velocity",)),
-        (
-            "robomimic",
-            "--network chi_transformer --hidden-dim 32",
-            ("--network chi_transformer", "hidden_dim=32", "num_heads"),
-        ),
+        ("robomimic", "--network chi_transformer,hidden_dim=32", ("--network", "hidden_dim=32", "num_heads")),
         ("robomimic", "--objective l1 --prior past bridge", ("--objective l1", "bridge")),
         ("robomimic", "--times start --prior past", ("--times start", "past")),
         ("robomimic", "--ray-address 127.0.0.1:1", ("--ray-address", "--engine ray")),

@@ -87,7 +87,7 @@ def test_mip_learns():
     method = Method("mip", H)
     observation = torch.rand(400, 1) * 2 - 1
     steps = {"observation": observation, "action": observation.sin(), "episode": torch.arange(400) // 100}
-    network = NetworkOptions(hidden_dim=32, observation_steps=1)
+    network = NetworkOptions("mlp,hidden_dim=32", observation_steps=1)
     options = {"network": network, "training": TrainingConfig(iterations=800), "description": None}
     options |= {"coupling": method.coupling(), **method.parts.played}
     actor = train_policy(TensorDict(steps, [400]), method.prior(), **options)

@@ -37,7 +37,7 @@ def test_run_writes_rows_report_and_pictures(dataset, tmp_path, capfd, monkeypat
     (task,) = described(out, "tasks")
     assert task["source"] == "file" and task["demonstrations"] == 3
     report, printed = (out / "report.md").read_text(), capfd.readouterr().out
-    assert "measured (file data)" in report and "network mlp (chi_transformer)" in report
+    assert "measured (file data)" in report and "network mlp,hidden_dim=16 (chi_transformer)" in report
     assert "Success (%), gain over Gaussian source" in printed and "played lift ph, past" in printed
     assert is_png(out / "success.png") and is_png(out / "learning_curves.png")
     assert len(list(out.glob("filmstrip_*.png"))) == (0 if rendering_backend() is None else 2)

@@ -214,7 +214,7 @@ def test_chosen_observations_are_read_from_held_out_demonstrations(tmp_path, mon
 def test_navigation_has_its_own_columns_and_pictures(preset, priors, tmp_path, capsys):
     out = tmp_path / "runs" / "out"
     few = {"prior": priors, "iterations": 5, "episodes": 4, "chunk": 32}
-    few |= {"preset": preset, "seeds": 1, "hidden_dim": 8}
+    few |= {"preset": preset, "seeds": 1, "network": "mlp,hidden_dim=8"}
     argv = command_line(**few, workers=1, logger="none", out=out)
     assert navigation1d.main(argv) == 0
     played, curved = stored(out), stored(out, "curvature")
@@ -242,7 +242,14 @@ def test_navigation_has_its_own_columns_and_pictures(preset, priors, tmp_path, c
     assert stored(out) == played and written(out.parent) == before
 
 
-TINY = {"iterations": 20, "episodes": 2, "workers": 1, "nfe": 2, "logger": "none", "hidden_dim": 16}
+TINY = {
+    "iterations": 20,
+    "episodes": 2,
+    "workers": 1,
+    "nfe": 2,
+    "logger": "none",
+    "network": "mlp,hidden_dim=16",
+}
 
 
 def test_real_time_chunking_of_a_task_beside_the_toy(dataset, tmp_path):

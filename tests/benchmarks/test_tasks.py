@@ -44,8 +44,9 @@ def test_joints_are_the_observation_that_is_named(dataset):
 
 
 def test_the_preset_of_the_public_code_from_training_to_report(dataset, tmp_path, capfd):
-    small = {"hidden_dim": 12, "batch_size": 16, "iterations": 6, "checkpoints": 1, "seeds": 1, "top_k": 1}
-    few = {"preset": "much-ado", "horizon": 24, "prior": "past", **small}
+    small = {"batch_size": 16, "iterations": 6, "checkpoints": 1, "seeds": 1, "top_k": 1}
+    network = "chi_transformer,observation_layers=2,time_frequency=1e-4,hidden_dim=12"
+    few = {"preset": "much-ado", "horizon": 24, "prior": "past", "network": network, **small}
     out = tmp_path / "run"
     assert robomimic.main(options(dataset, out, **few)) == 0
     (row,) = stored(out)

@@ -77,7 +77,7 @@ def test_a_format_is_a_class_and_a_line(place, tmp_path, capsys):
     np.testing.assert_array_equal(data["observation"], values[:, :2])
     np.testing.assert_array_equal(data["action"], values[:, 2:3])
     assert data["episode"].bincount().tolist() == [9, 12, 7]
-    options = ["--iterations", "2", "--hidden-dim", "8", "--chunk", "4", "--held-out", "1"]
+    options = ["--iterations", "2", "--network", "mlp,hidden_dim=8", "--chunk", "4", "--held-out", "1"]
     assert main(["train", place, "--out", str(tmp_path), *options]) == 0
     saved = capsys.readouterr().out.splitlines()[-1]
     kept = 21  # without the last demonstration
@@ -118,7 +118,7 @@ def test_steps_in_memory_whose_numbers_float32_would_round(key, dtype):
 
 
 def test_steps_and_their_demonstrations_train_the_same_policy():
-    options = {"network": NetworkOptions(hidden_dim=8), "training": TrainingConfig(iterations=2)}
+    options = {"network": NetworkOptions("mlp,hidden_dim=8"), "training": TrainingConfig(iterations=2)}
     given = (steps(), demonstrations_of(steps()), Task(demonstrations_of(steps())))
     one, *others = (train_policy(g, PastPrior(4), description=None, **options).state_dict() for g in given)
     for other in others:

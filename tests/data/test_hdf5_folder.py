@@ -75,7 +75,7 @@ def test_a_folder_is_a_place_of_train_and_of_benchmarks(sessions, tmp_path, monk
     assert load_task(DataOptions(dataset=folder, demonstrations=(5,)), None).identity != task.identity
     monkeypatch.chdir(folder)
     assert Task(open_demonstrations(".")).identity == task.identity
-    words = f"train . --iterations 1 --hidden-dim 8 --out {tmp_path}"
+    words = f"train . --iterations 1 --network mlp,hidden_dim=8 --out {tmp_path}"
     assert main(words.split()) == 0
     assert "sessions: 6 demonstrations, 34 steps" in capsys.readouterr().out
     (folder / "sunday.hdf5").rename(folder / "tuesday.hdf5")
@@ -184,7 +184,7 @@ def test_what_is_not_read_of_a_folder_is_left_out_by_name(sessions, tmp_path, ca
     place, others = open_demonstrations(folder), ["friday.backup", "old/ with 2 files", "spare/ with 1 file"]
     assert place.recording(place.index()).left_out[""] == others
     assert Task(place).recording.left_out[""] == others
-    words = f"train {folder} --iterations 1 --hidden-dim 8 --out {tmp_path}"
+    words = f"train {folder} --iterations 1 --network mlp,hidden_dim=8 --out {tmp_path}"
     assert main(words.split()) == 0
     assert not missing(capsys.readouterr().out, *others)
     for number in range(8):

@@ -38,7 +38,7 @@ from warmprior.transforms import CameraImages
 JOINTS = [f"{name}.pos" for name in ("pan", "lift", "elbow", "flex", "roll", "gripper")]
 CAMERAS = {"front": (480, 640), "wrist": (480, 848)}
 LENGTHS = (3, 1, 4)
-SMALL = {"hidden_dim": 8, "encoder": "small"}
+SMALL = {"network": "mlp,hidden_dim=8", "encoder": "small"}
 
 
 def scene(height, width, rng):
@@ -185,7 +185,7 @@ def test_steps_in_memory_are_resized_alike(episodes):
 
 def test_from_the_command_line_to_full_size_frames(places, episodes, tmp_path, capsys):
     place, (joints, names) = next(iter(places.items()))
-    small = "--encoder small --hidden-dim 8 --iterations 2 --batch-size 4 --chunk 2 --held-out 1"
+    small = "--encoder small --network mlp,hidden_dim=8 --iterations 2 --batch-size 4 --chunk 2 --held-out 1"
     argv = ["train", place, "--observations", joints, "--images", *names, "--out", str(tmp_path)]
     for number, (options, size, resize) in enumerate(
         ((["--image-size", "42", "--resize", "pad"], 42, "pad"), ([], 84, "squeeze"))

@@ -286,7 +286,7 @@ def test_an_environment_that_does_not_take_what_was_recorded(root):
 def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, capsys):
     name = written(observation=Box(-np.inf, np.inf, (3,), np.float32), env="Pendulum-v1", expert_policy=None)
     task = Task(open_demonstrations(f"minari:{name}"), play=Play(horizon=9))
-    small, short = NetworkOptions(hidden_dim=8), TrainingConfig(iterations=2)
+    small, short = NetworkOptions("mlp,hidden_dim=8"), TrainingConfig(iterations=2)
     actor = train_policy(task, PastPrior(4), tmp_path / "run", nfe=1, network=small, training=short)
     assert actor.sampling.nfe == 1
     actor = load_policy(tmp_path / "run" / "policy_000002")
@@ -304,7 +304,16 @@ def test_a_policy_is_trained_and_played_in_the_dataset_s_environment(tmp_path, c
 
 def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
     place = f"minari:{written(observation=TREE)}"
-    options = ["--observations", "arm", "--iterations", "2", "--hidden-dim", "8", "--held-out", "1"]
+    options = [
+        "--observations",
+        "arm",
+        "--iterations",
+        "2",
+        "--network",
+        "mlp,hidden_dim=8",
+        "--held-out",
+        "1",
+    ]
     assert not main(["train", place, "--out", str(tmp_path), "--nfe", "1", *options])
     said = capsys.readouterr().out
     assert "(1, " in said and "NFE 1" in said and "NFE 9" in said
@@ -315,7 +324,7 @@ def test_without_an_environment_only_playing_is_refused(tmp_path, capsys):
 def test_an_environment_that_reports_no_success_is_trained_for(tmp_path, capsys):
     space = Box(-np.inf, np.inf, (3,), np.float32)
     name = written(observation=space, success=False, env="Pendulum-v1", expert_policy=None)
-    small = ["--iterations", "2", "--hidden-dim", "8", "--out", str(tmp_path)]
+    small = ["--iterations", "2", "--network", "mlp,hidden_dim=8", "--out", str(tmp_path)]
     assert not main(["train", f"minari:{name}", *small])
     said = capsys.readouterr().out
     assert "only trained" in said and "to evaluate it" not in said

@@ -118,7 +118,7 @@ def test_a_policy_that_sees_the_history_and_a_learned_source_are_exported_too(un
     assert exported.shapes == {"state": (D_O,)}
     torch.testing.assert_close(chunks(exported, datas), chunks(actor, datas))
 
-    few = {"training": TrainingConfig(iterations=4), "network": NetworkOptions(hidden_dim=8)}
+    few = {"training": TrainingConfig(iterations=4), "network": NetworkOptions("mlp,hidden_dim=8")}
     learnt = train_policy(navigation_demonstrations(), CVAEPrior(4), **few, description=None).replace(nfe=2)
     exported = load_exported(export_policy(learnt, tmp_path / "cvae.pt2"))
     datas = list(decisions(learnt.prior, 9, dim=1))

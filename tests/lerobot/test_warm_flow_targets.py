@@ -101,7 +101,8 @@ def test_the_default_source_is_that_of_train(found, tmp_path, near, prior, capsy
     policy, _ = dataset_policy(found, root, n_action_steps=4)
     assert caplog.messages[-1].endswith(f"{prior} (--policy.prior)")
     assert policy.config.action_delta_indices == loaded == list(range(-4, 4))
-    words = f"train lerobot:{root} --out {tmp_path} --chunk 4 --iterations 1 --hidden-dim 8 --held-out 0"
+    words = f"train lerobot:{root} --out {tmp_path} --chunk 4 --iterations 1 --held-out 0"
+    words += " --network mlp,hidden_dim=8"
     assert main(words.split()) == 0
     trained = load_policy(capsys.readouterr().out.splitlines()[-1])
     assert policy.actor.prior.config() == trained.prior.config()

@@ -47,7 +47,7 @@ def lines_of(text):
 
 def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, capsys):
     path = robot_file(tmp_path / "arm.hdf5")
-    words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --held-out 1"
+    words = f"train {path} --iterations 1 --network mlp,hidden_dim=8 --out {tmp_path} --held-out 1"
     assert main(words.split()) == 0
     said = lines_of("\n".join(capsys.readouterr().out.splitlines()[:5]))
     assert said["observations"] == "robot0_eef_pos [3], robot0_gripper_qpos [2], force [1]"
@@ -62,7 +62,9 @@ def test_what_a_robots_file_holds_and_the_policy_does_not_see_is_said(tmp_path, 
 )
 def test_of_few_demonstrations_one_is_held_out(tmp_path, capsys, count, line):
     path = robot_file(tmp_path / "arm.hdf5")
-    words = f"train {path} --iterations 1 --hidden-dim 8 --out {tmp_path} --demonstrations {count}"
+    words = (
+        f"train {path} --iterations 1 --network mlp,hidden_dim=8 --out {tmp_path} --demonstrations {count}"
+    )
     assert main(words.split()) == 0
     assert line in capsys.readouterr().out
 
@@ -116,7 +118,7 @@ def test_a_size_of_images_without_images_is_refused(tmp_path, options):
 
 def test_a_training_of_a_place_says_it_above_its_progress(tmp_path, capsys):
     path = robot_file(tmp_path / "arm.hdf5")
-    options = {"network": NetworkOptions(hidden_dim=8), "training": TrainingConfig(iterations=1)}
+    options = {"network": NetworkOptions("mlp,hidden_dim=8"), "training": TrainingConfig(iterations=1)}
     train_policy(path, PastPrior(4), description=None, **options)
     assert not capsys.readouterr().err
     train_policy(path, PastPrior(4), **options)
@@ -235,7 +237,7 @@ def arm(root, names=JOINTS, near=0.05):
 
 def test_absolute_joint_targets_are_recognised_said_and_saved(tmp_path, capsys):
     place = arm(tmp_path / "arm")
-    words = ["train", place, "--iterations", "1", "--hidden-dim", "8", "--out", str(tmp_path)]
+    words = ["train", place, "--iterations", "1", "--network", "mlp,hidden_dim=8", "--out", str(tmp_path)]
     assert main(words) == 0
     *said, folder = capsys.readouterr().out.splitlines()
     lines = lines_of("\n".join(said[:7]))
@@ -268,7 +270,8 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
     features["observation.state"]["names"] = JOINTS
     features["action"]["names"] = {"motors": JOINTS[::-1]}
     values = write_lerobot(tmp_path / "arm", (9, 9), features, images=[("front", "image")], fps=30)
-    words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --hidden-dim 8 --out {tmp_path} --encoder small"
+    words = f"train lerobot:{tmp_path / 'arm'} --iterations 1 --out {tmp_path}"
+    words += " --network mlp,hidden_dim=8 --encoder small"
     words += " --observations observation.state observation.effort --images observation.images.front"
     words += " --held-out 0"
     assert main(words.split()) == 0
@@ -309,7 +312,10 @@ def test_a_policy_tells_what_it_needs_and_takes_the_names_of_its_dataset(tmp_pat
 def test_the_next_command_of_a_training_without_an_environment_runs_as_it_is_printed(tmp_path, capsys):
     path = robot_file(tmp_path / "arm.hdf5")
     out = tmp_path / "my arm's runs"
-    assert main(["train", str(path), "--iterations", "1", "--hidden-dim", "8", "--out", str(out)]) == 0
+    assert (
+        main(["train", str(path), "--iterations", "1", "--network", "mlp,hidden_dim=8", "--out", str(out)])
+        == 0
+    )
     *_, line, folder = capsys.readouterr().out.splitlines()
     words = shlex.split(line[line.index("python -m") : line.index(";")])
     assert words == ["python", "-m", "warmprior", "info", folder]

@@ -90,7 +90,7 @@ def test_no_action_leaves_the_range_of_the_demonstrations(precondition):
     moving = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
     raw = steps(action=torch.cat((moving, torch.full((40, 1), 0.7), 400_000 + 6 * moving), 1))
     task = own(raw, CountingEnv)
-    network = NetworkOptions(hidden_dim=8, precondition=precondition)
+    network = NetworkOptions("mlp,hidden_dim=8", precondition=precondition)
     policy = new_policy(task, GaussianPrior(4), network, TrainingConfig(iterations=1))
     observation = torch.randn(64, 2, 3, generator=torch.Generator().manual_seed(1))
     data = TensorDict({"observation": observation, "history": cold_history([64], 4, 4, 3)}, [64])
@@ -145,7 +145,7 @@ def test_absolute_actions_have_the_units_of_deltas(path):
     units = [0.05] * 3 + [0.5] * 6
     assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
     assert absolute.data["action"][:, 9].abs().max() <= 1
-    options = NetworkOptions(hidden_dim=16)
+    options = NetworkOptions("mlp,hidden_dim=16")
     made = [new_policy(t, GaussianPrior(8), options, TrainingConfig()) for t in (delta, absolute)]
     trends = [actor.network.trend for actor in made]
     assert trends[0] is None and isinstance(trends[1], RestingTrend)
@@ -172,7 +172,7 @@ def test_joint_targets_are_learnt_from_where_the_joints_are():
     assert task.identity != plain.identity == arm(seen, action).identity
     rest = task.normalizer.denormalize(TensorDict({"action": task.rest(task.data["observation"])}, [400]))
     torch.testing.assert_close(rest["action"][:, :2], seen[:, [2, 1]], rtol=1e-4, atol=1e-4)
-    options = NetworkOptions(hidden_dim=16, observation_steps=1)
+    options = NetworkOptions("mlp,hidden_dim=16", observation_steps=1)
     with_trend, without = (
         new_policy(t, GaussianPrior(1), options, TrainingConfig()).network for t in (task, plain)
     )
@@ -215,7 +215,7 @@ def test_joint_targets_beside_images():
     images = torch.zeros(60, 3, 16, 16, dtype=torch.uint8)
     observation = TensorDict({"state": seen, "front": images}, [60])
     task = arm(observation, action, [2, 1, -1])
-    options = NetworkOptions(hidden_dim=16, observation_steps=1, encoder="small", crop_size=12)
+    options = NetworkOptions("mlp,hidden_dim=16", observation_steps=1, encoder="small", crop_size=12)
     network = new_policy(task, GaussianPrior(1), options, TrainingConfig()).network
     data = task.data[:5]["observation"].unsqueeze(1)
     source, target = network.trend(network.encode(data))

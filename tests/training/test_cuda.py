@@ -112,7 +112,7 @@ def test_decisions_are_those_of_the_cpu():
 
 
 def test_a_policy_trains_compiled_and_plays_on_the_gpu(tmp_path):
-    task, network = navigation_task(), NetworkOptions(hidden_dim=8, observation_steps=1)
+    task, network = navigation_task(), NetworkOptions("mlp,hidden_dim=8", observation_steps=1)
     config = dataclasses.replace(CONFIG, iterations=8, checkpoints=1)
     options = {"network": network, "training": config, "description": None, "device": GPU, "compile": True}
     policy = train_policy(task, PastPrior(4), tmp_path, **options)

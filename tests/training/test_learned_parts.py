@@ -20,7 +20,7 @@ from warmprior.tasks import Task
 from warmprior.training import NetworkOptions, TrainingConfig, train_policy
 
 H = 4
-NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
+NETWORK = NetworkOptions("mlp,hidden_dim=8", observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)
 OPTIONS = {"network": NETWORK, "training": CONFIG, "description": None}
 
@@ -181,7 +181,7 @@ def test_what_it_cannot_read_is_refused_by_name(tmp_path):
     data = steps()
     images = torch.zeros(120, 3, 12, 12, dtype=torch.uint8)
     seen = TensorDict({"state": data["observation"], "camera": images}, [120])
-    network = NetworkOptions(hidden_dim=8, encoder="small", crop_size=10)
+    network = NetworkOptions("mlp,hidden_dim=8", encoder="small", crop_size=10)
     with raises(ValueError, "CVAEPrior", "vectors", "images"):
         policy_of(tmp_path, CVAEPrior(H), data.set("observation", seen), network=network)
     refuses(lambda: policy_of(tmp_path, CVAEPrior(H), see_history=True), ValueError, "see_history")

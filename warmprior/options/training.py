@@ -30,8 +30,7 @@ class NetworkOptions:
     Attributes:
         network: mlp is small; chi_transformer is the paper's, and plain_mlp that of its toy
             task; adaln_transformer is a faster transformer (adaptive layer norm); or package.module:Class of
-            your own. Options of the class follow, as in chi_transformer,num_layers=4.
-        hidden_dim: the network's option of this name, its width; the class's own by default.
+            your own. Options of the class follow, as in mlp,hidden_dim=256.
         precondition: use the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
         encoder: image encoder, one network per camera: ResNet-18 with ImageNet's weights, which torchvision
@@ -42,12 +41,11 @@ class NetworkOptions:
 
     Examples:
         >>> from warmprior.training import NetworkOptions
-        >>> NetworkOptions(network="chi_transformer", hidden_dim=48).observation_steps
+        >>> NetworkOptions("chi_transformer,hidden_dim=48").observation_steps
         2
     """
 
     network: str = "mlp"
-    hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
     encoder: Encoder = "resnet18-imagenet"
@@ -55,8 +53,9 @@ class NetworkOptions:
     share_encoder: bool = False
 
     def __post_init__(self) -> None:
-        check_whole_numbers(observation_steps=self.observation_steps)
-        check_whole_numbers(**given(hidden_dim=self.hidden_dim, crop_size=self.crop_size))
+        if not isinstance(self.network, str):
+            raise TypeError(f"network must be a name such as 'mlp,hidden_dim=256', got {self.network!r}")
+        check_whole_numbers(observation_steps=self.observation_steps, **given(crop_size=self.crop_size))
         check_choice("encoder", self.encoder, get_args(Encoder))
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 
 import torch
 
-from warmprior.checks import given
 from warmprior.modules import ImageEncoder, VelocityNetwork, VisionNetwork
 from warmprior.modules.encoder import load_imagenet
 from warmprior.options.data import Resize
 from warmprior.options.training import OF_IMAGES, PRETRAINED, NetworkOptions
-from warmprior.training.option_text import find, make
+from warmprior.training.option_text import find, make, options_of
 
 
 def network_class(options: NetworkOptions) -> type[VelocityNetwork]:
@@ -25,15 +25,21 @@ def network_class(options: NetworkOptions) -> type[VelocityNetwork]:
 def check_network(options: NetworkOptions) -> None:
     """Raise ValueError if there is no such network, or if it does not take its options.
 
-    A user's own is not built, since it may need the sizes of data.
+    A user's own is not built, since it may need the sizes of data: only the names of its options are checked.
     """
-    if network_class(options).__module__.startswith("warmprior."):
+    kind, sizes = network_class(options), (1, 1, 1, options.observation_steps)
+    if kind.__module__.startswith("warmprior."):
         with torch.device("meta"):  # nothing is computed
-            _make(options, 1, 1, 1, options.observation_steps)
+            _make(options, *sizes)
+        return
+    try:
+        inspect.signature(kind).bind(*sizes, **options_of(options.network))
+    except TypeError as error:
+        raise ValueError(f"{options.network} cannot be built: {error}") from error
 
 
 def _make(options: NetworkOptions, *sizes: int) -> VelocityNetwork:
-    network = make(VelocityNetwork, options.network, *sizes, **given(hidden_dim=options.hidden_dim))
+    network = make(VelocityNetwork, options.network, *sizes)
     network.check_sizes(*sizes)  # a constructor may take them in another order
     return network
 
@@ -54,7 +60,7 @@ def make_network(
     Examples:
         >>> import torch
         >>> from warmprior.training import NetworkOptions, make_network
-        >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
+        >>> options = NetworkOptions("chi_transformer,hidden_dim=48")
         >>> network = make_network(options, action_dim=7, observation_dim=23, prediction_length=8)
         >>> network(torch.zeros(1), torch.zeros(1, 8, 7), torch.zeros(1, options.observation_steps, 23)).shape
         torch.Size([1, 8, 7])

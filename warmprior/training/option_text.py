@@ -31,12 +31,12 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
     return cls
 
 
-def make[T: Registered](base: type[T], text: str, *args: Any, **options: Any) -> T:
+def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
     """Build an object from a name (:func:`find`) followed by options (:func:`options_of`).
 
-    ``args`` and ``options`` are further arguments of the constructor. Raises ValueError, with what is wrong
-    and what the constructor takes, or if the object cannot be saved. If the text may come from a file, look
-    up its name with :func:`registered`, which imports nothing, and pass the class to :func:`build`.
+    ``args`` are further arguments of the constructor. Raises ValueError, with what is wrong and what the
+    constructor takes, or if the object cannot be saved. If the text may come from a file, look up its name
+    with :func:`registered`, which imports nothing, and pass the class to :func:`build`.
 
     Examples:
         >>> from warmprior.training.option_text import make
@@ -44,7 +44,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any, **options: Any) ->
         >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
     """
-    made = build(find(base, text.partition(",")[0]), text, *args, **options)
+    made = build(find(base, text.partition(",")[0]), text, *args)
     try:
         made.config()
     except TypeError as error:
@@ -52,15 +52,12 @@ def make[T: Registered](base: type[T], text: str, *args: Any, **options: Any) ->
     return made
 
 
-def build[T: Registered](cls: type[T], text: str, *args: Any, **options: Any) -> T:
+def build[T: Registered](cls: type[T], text: str, *args: Any) -> T:
     """Build an object of a class with the options that follow a name, as :func:`make` does."""
-    typed = options_of(text)
-    if twice := ", ".join(sorted(typed.keys() & options.keys())):
-        raise ValueError(f"{twice} is given behind the name {text!r} and again: leave one out")
-    options |= typed
+    options = options_of(text)
     try:
         return cls(*args, **options)
-    except (TypeError, ValueError, ArithmeticError) as error:
+    except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         written = ", ".join([*map(repr, args), *(f"{n}={v!r}" for n, v in options.items())]) or "nothing"
         taken = ", ".join(list(inspect.signature(cls.__init__).parameters)[1:]) or "nothing"
         raise ValueError(

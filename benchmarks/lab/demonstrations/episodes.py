@@ -1,21 +1,17 @@
-"""Recorded episodes, those that are kept as demonstrations, and the files that robomimic opens."""
+"""Recorded episodes, and the files of them that robomimic opens."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torchrl._utils import logger
 
-from lab.demonstrations.scripted.operators import LEVELS, OPERATORS
+from lab.demonstrations.scripted.operators import LEVELS
 from warmprior.envs.control_loop import Observations, StepLoop
 from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
@@ -176,48 +172,3 @@ def _filter_keys(levels: list[str], rng: np.random.Generator) -> dict[str, set[i
         keys[name] = demos
         keys |= {f"{name}_{split}": demos & members for split, members in splits.items()}
     return {name: demos for name, demos in keys.items() if demos}
-
-
-def operator_of(style: str, seed: int) -> int:
-    """Return the index of the operator who plays a seed; in ``mh`` data operators take turns."""
-    return seed % len(OPERATORS) if style == "mh" else 0
-
-
-def successes(
-    call: Callable[[Callable[[str], Episode]], Future[Episode]],
-    play: Callable[..., Episode],
-    ahead: int,
-    style: str,
-    n: int,
-    first: int,
-    report: Callable[[int], Any],
-) -> Iterator[Episode]:
-    """Yield the first ``n`` solved episodes in the order of their seeds, the same number from each operator.
-
-    ``call`` submits ``play(state, seed=seed)`` to a process (:func:`~lab.io.workers.working`), ``ahead`` at a
-    time.
-    """
-    operators = len(OPERATORS) if style == "mh" else 1
-    remaining = [n // operators + (i < n % operators) for i in range(operators)]
-    limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
-    upcoming = iter(range(first, first + limit))
-    running: deque[Future[Episode]] = deque()
-    played = 0
-    while any(remaining):
-        while len(running) < ahead:
-            # Seeds of operators who have contributed enough are skipped, which does not change the result.
-            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
-            if following is None:
-                break
-            running.append(call(partial(play, seed=following)))
-        if not running:
-            raise RuntimeError(
-                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
-            )
-        episode = running.popleft().result()
-        played += 1
-        if episode.success and remaining[episode.operator]:
-            remaining[episode.operator] -= 1
-            report(1)
-            yield episode
-    logger.info(f"{n} demonstrations from {played} episodes")

@@ -2,57 +2,103 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+import importlib
+from collections import deque
+from collections.abc import Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from lab.demonstrations.episodes import SEEDS_PER_FILE, Episode, Recorder, successes, write_robomimic
+from lab.demonstrations.episodes import SEEDS_PER_FILE, Episode, Recorder, write_robomimic
 from lab.io.workers import available_cores, working
 from warmprior import WarmPriorActor
 from warmprior.checks import check_between, check_whole_numbers, given
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_name, environment_of
 from warmprior.envs.env_args import modernize_env_args
+from warmprior.envs.robosuite_tasks import low_dim_keys
 from warmprior.evaluation import play_episode
 from warmprior.evaluation.parallel import base_of
 from warmprior.io.extras import require
+from warmprior.io.files import check_writable
 from warmprior.options.defaults import EVALUATION_SEED
 from warmprior.saving import load_policy
 
 
+class PlayedPolicy:
+    """A saved policy that plays recorded episodes of robosuite.
+
+    Args:
+        folder: folder of the policy.
+        modules: modules to import first, which define its own prior, start point or network.
+
+    Raises:
+        ValueError: if the policy was made for another environment.
+    """
+
+    def __init__(self, folder: str | Path, modules: Sequence[str] = ()) -> None:
+        for module in modules:
+            importlib.import_module(module)
+        self.actor: WarmPriorActor = load_policy(folder)
+        self.env = environment_of(self.actor)
+        self._simulator: Any = base_of(self.env)
+        if not isinstance(self._simulator, RobosuiteEnv):
+            raise ValueError(
+                f"{folder} was made for {environment_name(self.actor)}, and only episodes of robosuite are "
+                "written: record others with evaluate(), and train on them with demonstrations_of()"
+            )
+        # Policies that see images read no poses of objects, which readers and the rendering expect.
+        loop = self._simulator.loop
+        keys = dict.fromkeys((*self._simulator.low_dim_keys, *low_dim_keys(len(loop.env.robots))))
+        recorder: Any = Recorder(type(loop)(loop.env, tuple(keys)))
+        self._simulator.loop = recorder
+
+    @property
+    def model_file(self) -> str:
+        """The simulator's model as XML."""
+        return str(self._simulator.loop.env.sim.model.get_xml())
+
+    def play(self, seed: int, nfe: int | None) -> Episode:
+        """Play the episode of a seed."""
+        solved = play_episode(self.actor, self.env, seed, nfe=nfe).success
+        return self._simulator.loop.episode(seed, success=solved)
+
+
 def play_demonstrations(
     folder: str | Path,
-    n: int = 200,
+    episodes: int = 200,
     seed: int = 1,
     *,
     path: str | Path,
     nfe: int | None = None,
     overwrite: bool = False,
     workers: int | None = None,
+    modules: Sequence[str] = (),
 ) -> Path:
-    """Let a saved policy play, and write what it solves as demonstrations in robomimic's HDF5 layout.
+    """Let a saved policy play, and write the episodes that it solves in robomimic's HDF5 layout.
 
-    The file has states, from which images can be rendered, and the observations of the policy's environment.
-    Episode ``k`` plays simulator seed ``seed * 100_000 + k``, as in :func:`generate_demonstrations`, whose
-    demonstrations of training have the seed 0, and the first ``n`` that succeed are kept in that order. The
-    content does not depend on the number of workers.
+    The file has the observations of the policy and of the task, and states, from which images can be
+    rendered. Episode ``k`` plays simulator seed ``seed * 100_000 + k``, as those of
+    :func:`~lab.demonstrations.scripted.generate.generate_demonstrations` do. The content does not depend on
+    the number of workers.
 
     Args:
         folder: folder of the policy, made for an environment of robosuite.
-        n: number of demonstrations.
-        seed: 0 to 99; files of different seeds share no episode.
+        episodes: number of episodes to play.
+        seed: 0 to 99; files of different seeds share no episode. Scripted training data have the seed 0, and
+            held-out ones 50.
         path: file to write.
         nfe: network evaluations per chunk; the policy's own by default.
         overwrite: replace an existing file.
         workers: number of processes; ``None`` for one per available core.
+        modules: modules to import first, which define the policy's own prior, start point or network.
 
     Raises:
         FileExistsError: if ``path`` exists.
-        ValueError: if the policy was made for another environment, or an option is out of range.
-        RuntimeError: if the policy fails too often to reach ``n``.
+        ValueError: if the policy was made for another environment, solves no episode, or an option is out of
+            range.
 
     Examples:
         >>> from lab.demonstrations.played import play_demonstrations
@@ -60,44 +106,51 @@ def play_demonstrations(
         PosixPath('own.hdf5')
     """
     check_between(0, EVALUATION_SEED // SEEDS_PER_FILE - 1, seed=seed)
-    check_whole_numbers(n=n, **given(workers=workers, nfe=nfe))
-    check_between(1, SEEDS_PER_FILE, n=n)
+    check_whole_numbers(episodes=episodes, **given(workers=workers))
+    check_between(1, SEEDS_PER_FILE, episodes=episodes)
     path = Path(path)
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name a file in it")
+    check_writable(path.parent)
     require("h5py", "sim")
-    actor, env = _playing(str(folder))  # an error is better raised here than in a worker
-    description: Any = actor.environment
-    model_file = str(base_of(env).loop.env.sim.model.get_xml())
-    workers = min(n, workers or available_cores())
-    with working(workers, str(folder)) as call, tqdm(total=n, desc="play", unit="demo") as bar:
-        write_robomimic(
-            path,
-            successes(call, partial(_play, nfe=nfe), 2 * workers, "ph", n, seed * SEEDS_PER_FILE, bar.update),
-            env_args=modernize_env_args(description["robosuite"]["env_args"]),
-            model_file=model_file,
-            seed=seed,
-            attributes={"source": "policy"},
-        )
+    here = PlayedPolicy(folder, modules)  # an error is better raised here than in a worker
+    nfe = here.actor.sampling.evaluations(nfe)
+    description: Any = here.actor.environment
+    seeds = range(seed * SEEDS_PER_FILE, seed * SEEDS_PER_FILE + episodes)
+    workers = min(episodes, workers or available_cores())
+    job = partial(_play, folder=str(folder), modules=tuple(modules), nfe=nfe)
+
+    def solved() -> Iterator[Episode]:
+        found = 0
+        with working(workers, None) as call, tqdm(total=episodes, desc="play", unit="ep") as bar:
+            running, upcoming = deque[Any](), iter(seeds)
+            for _ in seeds:
+                while len(running) < 2 * workers and (following := next(upcoming, None)) is not None:
+                    running.append(call(partial(job, seed=following)))
+                episode = running.popleft().result()
+                bar.update()
+                if episode.success:
+                    found += 1
+                    bar.set_postfix(solved=found, refresh=False)
+                    yield episode
+        if not found:
+            raise ValueError(f"{folder} solves none of {episodes} episodes: play more, or train it further")
+
+    write_robomimic(
+        path,
+        solved(),
+        env_args=modernize_env_args(description["robosuite"]["env_args"]),
+        model_file=here.model_file,
+        seed=seed,
+        attributes={"source": "policy"},
+    )
     return path
 
 
-@lru_cache(maxsize=1)
-def _playing(folder: str) -> tuple[WarmPriorActor, EnvBase]:
-    """Return a policy, and its environment, whose simulator records."""
-    actor = load_policy(folder)
-    env = environment_of(actor)
-    simulator: Any = base_of(env)
-    if not isinstance(simulator, RobosuiteEnv):
-        raise ValueError(
-            f"{folder} was made for {environment_name(actor)}, and episodes of robosuite alone are written: "
-            "evaluate() plays others, and demonstrations_of() takes what you record"
-        )
-    simulator.loop = cast(Any, Recorder(simulator.loop))
-    return actor, env
+_played = cache(PlayedPolicy)
 
 
-def _play(folder: str, seed: int, nfe: int | None) -> Episode:
-    actor, env = _playing(folder)
-    played = play_episode(actor, env, seed, nfe=nfe)
-    return base_of(env).loop.episode(seed, success=played.success)
+def _play(_: None, folder: str, modules: tuple[str, ...], seed: int, nfe: int) -> Episode:
+    return _played(folder, modules).play(seed, nfe)

@@ -47,7 +47,7 @@ WHY_QUICK = (
 # minutes on two cores.
 SMALL_IMAGES: dict[str, dict[str, Any]] = {
     "data": {"image_size": 48, "fast_rendering": True},
-    "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
+    "network": {"network": "mlp,hidden_dim=256", "encoder": "small", "crop_size": 42},
     "training": {"iterations": 3_000, "batch_size": 64},
 }
 IMAGES: dict[str, dict[str, dict[str, Any]]] = {

@@ -231,7 +231,9 @@ def test_images_that_cannot_be_compared_are_taken_with_a_warning(picture, monkey
 
 def test_a_policy_trains_from_images_where_nothing_renders(picture, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("warmprior.envs.rendering.rendering_backend", lambda: None)
-    small = "--encoder small --crop-size 12 --hidden-dim 8 --iterations 1 --batch-size 2 --held-out 0"
+    small = (
+        "--encoder small --crop-size 12 --network mlp,hidden_dim=8 --iterations 1 --batch-size 2 --held-out 0"
+    )
     argv = f"train {picture} --fast-rendering --out {tmp_path / 'out'} {small} --images".split()
     with pytest.warns(UserWarning, match=picture.name):
         assert main([*argv, *IMAGES]) == 0

@@ -17,9 +17,14 @@ pytest.importorskip("h5py")
 import h5py
 import robosuite
 
-from lab.demonstrations.episodes import Episode, operator_of, write_robomimic
+from lab.demonstrations.episodes import Episode, write_robomimic
 from lab.demonstrations.scripted import generate as generate_module
-from lab.demonstrations.scripted.generate import expert_loop, generate_demonstrations, run_episode
+from lab.demonstrations.scripted.generate import (
+    expert_loop,
+    generate_demonstrations,
+    operator_of,
+    run_episode,
+)
 from lab.demonstrations.scripted.motion import CLOSED, transfer
 from tests.errors import raises, refuses
 from warmprior.envs.robosuite_tasks import TASKS

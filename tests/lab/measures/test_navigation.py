@@ -32,7 +32,7 @@ def trained(tmp_path_factory):
         recipe |= {"iterations": iterations, "save_every": iterations, "checkpoints": 1, "seed": seed}
         recipe |= {"batch_size": 256, "learning_rate": 2e-3, "warmup_ratio": 0.0}
         recipe["cold_probability"] = 0.0 if name in ("gaussian", "regression") else 0.1
-        options |= {"network": NetworkOptions(hidden_dim=128, observation_steps=1), "description": None}
+        options |= {"network": NetworkOptions("mlp,hidden_dim=128", observation_steps=1), "description": None}
         out = folder / f"{name}-{iterations}-{seed}"
         return train_policy(navigation_task(), make(), out, training=TrainingConfig(**recipe), **options)
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torchrl._utils import logger
 from tqdm import tqdm
 
-from lab.demonstrations.episodes import (
-    SEEDS_PER_FILE,
-    Episode,
-    Recorder,
-    operator_of,
-    successes,
-    write_robomimic,
-)
+from lab.demonstrations.episodes import SEEDS_PER_FILE, Episode, Recorder, write_robomimic
 from lab.demonstrations.scripted.experts import EXPERTS
 from lab.demonstrations.scripted.motion import ArmRunner
 from lab.demonstrations.scripted.operators import OPERATORS, SKILLED, Demonstrator
@@ -40,6 +38,11 @@ def expert_loop(task: str) -> ControlLoop:
     spec = get_task(task)
     extra = (f"robot{i}_{key}" for i in range(spec.arms) for key in _EXTRA_KEYS)
     return ControlLoop(make_simulator(task_env_args(task)), (*spec.low_dim_keys, *extra))
+
+
+def operator_of(style: str, seed: int) -> int:
+    """Return the index of the operator who plays a seed; in ``mh`` data operators take turns."""
+    return seed % len(OPERATORS) if style == "mh" else 0
 
 
 def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
@@ -132,15 +135,48 @@ def generate_demonstrations(
         model_file = call(_model).result()
         write_robomimic(
             path,
-            successes(
-                call, partial(_play, style=style), 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update
-            ),
+            _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
             env_args=task_env_args(task),
             model_file=model_file,
             seed=seed,
             attributes={"source": "scripted", "generator_version": GENERATOR_VERSION},
         )
     return path
+
+
+def _successes(
+    call: Callable[[Callable[[str], Episode]], Future[Episode]],
+    ahead: int,
+    style: str,
+    n: int,
+    first: int,
+    report: Callable[[int], Any],
+) -> Iterator[Episode]:
+    """Yield the first ``n`` successes in the order of their seeds, the same number from each operator."""
+    operators = len(OPERATORS) if style == "mh" else 1
+    remaining = [n // operators + (i < n % operators) for i in range(operators)]
+    limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
+    upcoming = iter(range(first, first + limit))
+    running: deque[Future[Episode]] = deque()
+    played = 0
+    while any(remaining):
+        while len(running) < ahead:
+            # Seeds of operators who have contributed enough are skipped, which does not change the result.
+            following = next((s for s in upcoming if remaining[operator_of(style, s)]), None)
+            if following is None:
+                break
+            running.append(call(partial(_play, style=style, seed=following)))
+        if not running:
+            raise RuntimeError(
+                f"only {n - sum(remaining)} of {n} demonstrations succeeded in {played} episodes"
+            )
+        episode = running.popleft().result()
+        played += 1
+        if episode.success and remaining[episode.operator]:
+            remaining[episode.operator] -= 1
+            report(1)
+            yield episode
+    logger.info(f"{n} demonstrations from {played} scripted episodes")
 
 
 @cache
