@@ -46,8 +46,7 @@ class PlayedPolicy:
         self._simulator: Any = base_of(self.env)
         if not isinstance(self._simulator, RobosuiteEnv):
             raise ValueError(
-                f"{folder} was made for {environment_name(self.actor)}, and only episodes of robosuite are "
-                "written: record others with evaluate(), and train on them with demonstrations_of()"
+                f"{folder} was made for {environment_name(self.actor)}, but episodes are robosuite's alone"
             )
         # Policies that see images read no poses of objects, which readers and the rendering expect.
         loop = self._simulator.loop
