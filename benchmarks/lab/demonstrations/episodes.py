@@ -12,12 +12,31 @@ from typing import Any
 import numpy as np
 
 from lab.demonstrations.scripted.operators import LEVELS
+from warmprior.checks import check_between, check_whole_numbers
 from warmprior.envs.control_loop import Observations, StepLoop
 from warmprior.io.extras import require
-from warmprior.io.files import write_atomic
+from warmprior.io.files import check_writable, write_atomic
+from warmprior.options.defaults import EVALUATION_SEED
 
 #: The file of a ``seed`` uses at most this many simulator seeds, from ``seed * SEEDS_PER_FILE`` on.
 SEEDS_PER_FILE = 100_000
+
+
+def seeds_of(seed: int, n: int) -> range:
+    """Return the simulator seeds of the first ``n`` episodes of a file; raise ValueError if out of range."""
+    check_between(0, EVALUATION_SEED // SEEDS_PER_FILE - 1, seed=seed)
+    check_whole_numbers(n=n)
+    check_between(1, SEEDS_PER_FILE, n=n)
+    return range(seed * SEEDS_PER_FILE, seed * SEEDS_PER_FILE + n)
+
+
+def check_file(path: Path, overwrite: bool) -> None:
+    """Raise an OSError if a file cannot be written, or exists and shall not be replaced."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name a file in it")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
+    check_writable(path.parent)
 
 
 @dataclass

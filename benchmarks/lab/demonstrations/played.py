@@ -11,10 +11,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lab.demonstrations.episodes import SEEDS_PER_FILE, Episode, Recorder, write_robomimic
+from lab.demonstrations.episodes import Episode, Recorder, check_file, seeds_of, write_robomimic
 from lab.io.workers import available_cores, working
 from warmprior import WarmPriorActor
-from warmprior.checks import check_between, check_whole_numbers, given
+from warmprior.checks import check_whole_numbers, given
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_name, environment_of
 from warmprior.envs.env_args import modernize_env_args
@@ -22,8 +22,6 @@ from warmprior.envs.robosuite_tasks import low_dim_keys
 from warmprior.evaluation import play_episode
 from warmprior.evaluation.parallel import base_of
 from warmprior.io.extras import require
-from warmprior.io.files import check_writable
-from warmprior.options.defaults import EVALUATION_SEED
 from warmprior.saving import load_policy
 
 
@@ -67,7 +65,7 @@ class PlayedPolicy:
 
 def play_demonstrations(
     folder: str | Path,
-    episodes: int = 200,
+    n: int = 200,
     seed: int = 1,
     *,
     path: str | Path,
@@ -85,7 +83,7 @@ def play_demonstrations(
 
     Args:
         folder: folder of the policy, made for an environment of robosuite.
-        episodes: number of episodes to play.
+        n: number of episodes to play.
         seed: 0 to 99; files of different seeds share no episode. Scripted training data have the seed 0, and
             held-out ones 50.
         path: file to write.
@@ -104,30 +102,23 @@ def play_demonstrations(
         >>> play_demonstrations("policies/lift", 20, path="own.hdf5")  # doctest: +SKIP
         PosixPath('own.hdf5')
     """
-    check_between(0, EVALUATION_SEED // SEEDS_PER_FILE - 1, seed=seed)
-    check_whole_numbers(episodes=episodes, **given(workers=workers))
-    check_between(1, SEEDS_PER_FILE, episodes=episodes)
-    path = Path(path)
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name a file in it")
-    check_writable(path.parent)
+    seeds, path = seeds_of(seed, n), Path(path)
+    check_whole_numbers(**given(workers=workers))
+    check_file(path, overwrite)
     require("h5py", "sim")
     here = PlayedPolicy(folder, modules)  # an error is better raised here than in a worker
     nfe = here.actor.sampling.evaluations(nfe)
     description: Any = here.actor.environment
-    seeds = range(seed * SEEDS_PER_FILE, seed * SEEDS_PER_FILE + episodes)
-    workers = min(episodes, workers or available_cores())
-    job = partial(_play, folder=str(folder), modules=tuple(modules), nfe=nfe)
+    workers = min(n, workers or available_cores())
+    state = str(folder), tuple(modules)
 
     def solved() -> Iterator[Episode]:
         found = 0
-        with working(workers, None) as call, tqdm(total=episodes, desc="play", unit="ep") as bar:
+        with working(workers, state) as call, tqdm(total=n, desc="play", unit="ep") as bar:
             running, upcoming = deque[Any](), iter(seeds)
             for _ in seeds:
                 while len(running) < 2 * workers and (following := next(upcoming, None)) is not None:
-                    running.append(call(partial(job, seed=following)))
+                    running.append(call(partial(_play, seed=following, nfe=nfe)))
                 episode = running.popleft().result()
                 bar.update()
                 if episode.success:
@@ -135,7 +126,7 @@ def play_demonstrations(
                     bar.set_postfix(solved=found, refresh=False)
                     yield episode
         if not found:
-            raise ValueError(f"{folder} solves none of {episodes} episodes: play more, or train it further")
+            raise ValueError(f"{folder} solves none of {n} episodes: play more, or train it further")
 
     write_robomimic(
         path,
@@ -151,5 +142,5 @@ def play_demonstrations(
 _played = cache(PlayedPolicy)
 
 
-def _play(_: None, folder: str, modules: tuple[str, ...], seed: int, nfe: int) -> Episode:
-    return _played(folder, modules).play(seed, nfe)
+def _play(state: tuple[str, tuple[str, ...]], seed: int, nfe: int) -> Episode:
+    return _played(*state).play(seed, nfe)

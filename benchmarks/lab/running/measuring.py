@@ -1,4 +1,4 @@
-"""What is measured of a policy: on its training data, on data that it has not seen, and as it plays."""
+"""This module measures policies: on their training data, on data that they have not seen, and at play."""
 
 from __future__ import annotations
 

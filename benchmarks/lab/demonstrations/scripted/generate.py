@@ -13,18 +13,24 @@ import numpy as np
 from torchrl._utils import logger
 from tqdm import tqdm
 
-from lab.demonstrations.episodes import SEEDS_PER_FILE, Episode, Recorder, write_robomimic
+from lab.demonstrations.episodes import (
+    SEEDS_PER_FILE,
+    Episode,
+    Recorder,
+    check_file,
+    seeds_of,
+    write_robomimic,
+)
 from lab.demonstrations.scripted.experts import EXPERTS
 from lab.demonstrations.scripted.motion import ArmRunner
 from lab.demonstrations.scripted.operators import OPERATORS, SKILLED, Demonstrator
 from lab.io.workers import available_cores, working
-from warmprior.checks import check_between, check_choice, check_whole_numbers, given
+from warmprior.checks import check_choice, check_whole_numbers, given
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.robosuite_tasks import get_task
 from warmprior.envs.simulator import import_robosuite, make_simulator, task_env_args
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
-from warmprior.options.defaults import EVALUATION_SEED
 
 #: Part of every cached file's name; raised when the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
@@ -117,17 +123,15 @@ def generate_demonstrations(
             "(download_robomimic, or --download)"
         )
     check_choice("style", style, _STYLES)
-    check_between(0, EVALUATION_SEED // SEEDS_PER_FILE - 1, seed=seed)
-    check_whole_numbers(n=n, **given(workers=workers))
-    check_between(1, SEEDS_PER_FILE, n=n)
+    first = seeds_of(seed, n).start
+    check_whole_numbers(**given(workers=workers))
     if path is None:
         name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
         path = cache_folder() / "scripted" / name
         if path.exists():
             return path
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
+    check_file(path, overwrite)
     require("h5py", "sim")
     import_robosuite()
     workers = min(n, workers or available_cores())
@@ -135,7 +139,7 @@ def generate_demonstrations(
         model_file = call(_model).result()
         write_robomimic(
             path,
-            _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
+            _successes(call, 2 * workers, style, n, first, bar.update),
             env_args=task_env_args(task),
             model_file=model_file,
             seed=seed,
