@@ -1,3 +1,4 @@
+import inspect
 import json
 import math
 
@@ -81,6 +82,21 @@ SIZES |= dict.fromkeys([AdaLNTransformer, ChiTransformer], "hidden_dim num_layer
 @pytest.mark.parametrize("value", [0, -3, 1.5])
 def test_a_size_that_cannot_work_is_named(kind, size, value):
     refuses(lambda: kind(2, 3, 4, **{size: value}), ValueError, size, value)
+
+
+NUMBERS = [
+    (kind, parameter.name)
+    for kind in SIZES
+    for parameter in inspect.signature(kind).parameters.values()
+    if isinstance(parameter.default, (int, float))
+]
+
+
+@pytest.mark.parametrize(("kind", "option"), NUMBERS)
+@pytest.mark.parametrize("value", [True, math.nan, "3", [1], -1])
+def test_an_option_that_is_no_number_of_its_range_is_named(kind, option, value):
+    sizes = dict.fromkeys(["action_dim", "observation_dim", "prediction_length"], 2)
+    refuses(lambda: kind(**sizes | {option: value}), ValueError, option)
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])

@@ -189,8 +189,9 @@ class TimestepEmbedding(nn.Module):
     def __init__(self, dim: int, last: float = 100.0) -> None:
         super().__init__()
         check_positive(time_frequency=last)
-        if dim < 4 or dim % 2:
-            raise ValueError(f"the timestep embedding must be even and >= 4, got {dim}")
+        check_whole_numbers(4, timestep_embedding_dim=dim)
+        if dim % 2:
+            raise ValueError(f"timestep_embedding_dim must be even, got {dim}")
         self.frequencies = nn.Buffer(torch.logspace(0, math.log10(last), dim // 2), persistent=False)
 
     def forward(self, t: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from warmprior.checks import check_whole_numbers
+from warmprior.checks import check_share, check_whole_numbers
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 
 
@@ -46,7 +46,8 @@ class ChiTransformer(VelocityNetwork):
         time_frequency: the highest frequency of the time embedding; the lowest is 1.
 
     Raises:
-        ValueError: if a size is not positive, or ``num_heads`` does not divide ``hidden_dim``.
+        ValueError: if a size is not positive, ``dropout`` is not in [0, 1), or ``num_heads`` does not divide
+            ``hidden_dim``.
 
     Examples:
         >>> import torch
@@ -75,6 +76,7 @@ class ChiTransformer(VelocityNetwork):
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         _check_sizes(num_heads, hidden_dim, num_layers, observation_layers)
+        check_share(dropout=dropout)
         self.hidden_dim, self.num_layers, self.num_heads = hidden_dim, num_layers, num_heads
         self.timestep_embedding_dim, self.dropout = timestep_embedding_dim, dropout
         self.observation_layers, self.time_frequency = observation_layers, time_frequency
