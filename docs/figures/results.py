@@ -60,8 +60,8 @@ LENGTHS = {  # demonstrations whose runs differ in the length of training
 WARM = (PAST, PREVIEW, CORRELATED)
 LIFT_AGENTS = "agents_lift"
 AGENTS = {
-    "lift, weak policies, three seeds": LIFT_AGENTS,
-    "square, one or two seeds": "agents_square_mh_5000",
+    "lift, weak policies": LIFT_AGENTS,
+    "square, 25 demonstrations": "agents_square_25_small",
 }
 
 
@@ -137,11 +137,13 @@ def iterations() -> None:
 
 def agents() -> None:
     """Draw chart D: success of agents in source space, the mean over seeds and every seed."""
-    picture, axes = figure(WIDTH, 4.4, len(AGENTS), "Agents in the source space of frozen policies")
+    picture, axes = figure(WIDTH, 4.4, len(AGENTS), "Agents around frozen policies, three seeds")
     for axis, (task, name) in zip(axes, AGENTS.items(), strict=True):
-        for arm, part in read_arms(name).query("centre != 'zero'").groupby("arm", sort=False):
-            _, color, _ = SOURCES[part["prior"].iloc[0]]
-            style, mark = ("--", "s") if part["algorithm"].iloc[0] == "dsrl-sac" else ("-", "o")
+        for arm, part in read_arms(name).groupby("arm", sort=False):
+            prior, algorithm, centre = part[["prior", "algorithm", "centre"]].iloc[0]
+            _, color, _ = SOURCES[prior]
+            style, mark = ("--", "s") if algorithm == "dsrl-sac" else ("-", "o")
+            style, mark = (":", "x") if centre == "zero" else (style, mark)
             for _, curve in part.groupby("seed"):
                 rates = 100 * curve["success_rate"]
                 axis.plot(curve["environment_steps"] / 1_000, rates, style, color=color, lw=0.7, alpha=0.4)

@@ -109,9 +109,8 @@ def save(picture: Figure, name: str) -> None:
     shown = [pair for axis in picture.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in reversed(shown)}
     labels = sorted(handles, key=[label for _, label in shown].index)
-    picture.legend(
-        [handles[label] for label in labels], labels, loc="outside lower center", ncols=2, frameon=False
-    )
+    lines_shown, tight = [handles[label] for label in labels], {"columnspacing": 1.0, "handlelength": 1.5}
+    picture.legend(lines_shown, labels, loc="outside lower center", ncols=2, frameon=False, **tight)
     picture.savefig(OUT / f"{name}.svg", **SVG)
 
 
